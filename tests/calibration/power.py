@@ -12,8 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from mars_lidar.calibration.calibration import _Run
+from mars_lidar.calibration.calibration import Calibration, _Run
 from mars_lidar.calibration.look import look_at
+from mars_lidar.calibration.model import Model
 from mars_lidar.calibration.recording import recording_of
 from tests.calibration.photon_by_photon import as_timestamps, photon_by_photon
 from tests.calibration.sweep import EFFECTS, ORDINARY, with_effect
@@ -30,7 +31,8 @@ def main() -> None:
     truth = replace(with_effect(ORDINARY, asked.effect), jitter=asked.jitter)
     t, cycles = photon_by_photon(truth, asked.photons, asked.seed)
     recording = recording_of(as_timestamps(t, truth, cycles))
-    fitted = _Run(recording, look_at(recording), "gaussian", 1, {}, {}, 0.01, asked.seed).first()
+    described, model = Calibration(look_at(recording), recording), Model(recording.clock, 1)
+    _, fitted = _Run(described, model, {}, asked.seed).first()
     used = fitted.batch.common
     weight = fitted.batch.weight[np.ix_(used, used)]
     own, drawn = fitted.rest[used], fitted.fresh[:, used]

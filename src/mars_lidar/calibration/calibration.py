@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -20,7 +19,7 @@ from mars_lidar.calibration.look import Look, look_at
 from mars_lidar.calibration.model import Model, Waveform, all_carriers
 from mars_lidar.calibration.realizations import Realizations, realizations
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording, recording_of, recording_of_arrivals
-from mars_lidar.calibration.suspects import Drift, Named, Trial
+from mars_lidar.calibration.suspects import Drift, Score, Trial
 from mars_lidar.instrument.avalanches import Afterpulsing
 from mars_lidar.instrument.detector import Detector
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, Jitter
@@ -51,10 +50,10 @@ class Estimate:
     fit the stream as well (`Calibration.limits`).
     """
 
-    value: float
-    error: float
-    low: float
-    high: float
+    value: float = np.nan
+    error: float = np.nan
+    low: float = np.nan
+    high: float = np.nan
     note: str = ""
     least: float = np.nan
     most: float = np.nan
@@ -84,20 +83,19 @@ class Suspect:
 
     name: str
     z: float
-    size: float
-    error: float
-    gain: float
-    option: str
-    included: bool
+    size: float = np.nan
+    error: float = np.nan
+    gain: float = np.nan
+    option: str = ""
+    included: bool = False
 
     def __str__(self) -> str:
         size = "" if np.isnan(self.size) else f" {self.size:.3g}"
         size += "" if np.isnan(self.error) else f" ± {self.error:.2g}"
-        gain = (
-            "" if np.isnan(self.gain) else f", including it reduces the misfit by {self.gain:.1f} standard deviations"
-        )
+        clear = f"{self.z:.1f} standard deviations" if self.z > 0.0 else "no significant score"
+        if not np.isnan(self.gain):
+            clear += f", including it reduces the misfit by {self.gain:.1f} standard deviations"
         state = "in the result" if self.included else f"not in the result: {self.option}"
-        clear = f"{self.z:.1f} standard deviations{gain}" if self.z > 0.0 else f"no significant score{gain}"
         return f"{self.name}{size} ({clear}); {state}"
 
 
@@ -111,7 +109,7 @@ class Limit:
 
     name: str
     words: str
-    limit: float
+    limit: float = np.nan
     ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     def __str__(self) -> str:
@@ -129,6 +127,8 @@ class Calibration:
     ----------
     look
         Content of the recording, before any model.
+    recording
+        The recorded times.
     estimates
         By name: ``signal``, ``background`` (photons per period), ``delay_ns``, ``width_ns`` (sigma of the recorded
         pulse, jitter included), ``pulse_sigma_ns``, ``jitter_ns`` (sigma), ``dead_time_ns``, and those of the effects
@@ -145,8 +145,8 @@ class Calibration:
         Instrument and light of these estimates, for `simulate`; None with ``look=True``.
     waveform, waveform_error
         Light (bins,) as recorded, jitter included, in photons per period and bin, with ``pulse="free"``; else None.
-    recording, fitted
-        The recorded times and the fit, of which figures and `realizations` are made; no fit with ``look=True``.
+    fitted
+        The fit, of which, with `recording`, figures and `realizations` are made; None with ``look=True``.
     level
         False-alarm probability of the verdict.
 
@@ -170,17 +170,17 @@ class Calibration:
     """
 
     look: Look
-    estimates: dict[str, Estimate]
-    p_value: float
-    suspects: tuple[Suspect, ...]
-    limits: tuple[Limit, ...]
-    drift: Drift | None
-    system: System | None
-    flux: Flux | None
-    waveform: FloatArray | None
-    waveform_error: FloatArray | None
     recording: Recording
-    fitted: Fitted | None
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+    p_value: float = np.nan
+    suspects: tuple[Suspect, ...] = ()
+    limits: tuple[Limit, ...] = ()
+    drift: Drift | None = None
+    system: System | None = None
+    flux: Flux | None = None
+    waveform: FloatArray | None = None
+    waveform_error: FloatArray | None = None
+    fitted: Fitted | None = None
     level: float = LEVEL
 
     __repr__ = brief
@@ -200,9 +200,8 @@ class Calibration:
         if not self.fitted.converged:
             remedy = "give what is known (dead_time_ns, jitter_ns), pulse='free', returns=2, or a longer recording"
             return f"the fit of {model} did not converge, nothing is estimated: {remedy}"
-        if self.fits:
-            return f"p = {self.p_value:.2g}: {model} is not rejected at the {self.level:.0%} level"
-        return f"p = {self.p_value:.2g}: {model} does not fit"
+        outcome = f"is not rejected at the {self.level:.0%} level" if self.fits else "does not fit"
+        return f"p = {self.p_value:.2g}: {model} {outcome}"
 
     def realizations(self, cycles: int, *, simulated: int = 4000, seed: int = 0) -> Realizations:
         """Distribution of the count in pieces of `cycles` periods, and of `simulated` pieces drawn with `seed` (T6).
@@ -304,183 +303,167 @@ def calibrate(
         if not isinstance(value, bool):
             raise TypeError(f"{name} must be True or False, got {value!r}")
     start_seed = checks.integer("seed", seed, low=0, high=2**31)
-    recording = _recorded(times, pooled, checks.real("unit_ns", unit_ns, low=0.0))
+    unit = checks.real("unit_ns", unit_ns, low=0.0)
+    streams: Any = [times] if isinstance(times, Timestamps) else times
+    if isinstance(streams, Sequence) and len(streams) > 0 and all(isinstance(each, Timestamps) for each in streams):
+        recording = recording_of(streams, pooled=pooled)
+    else:
+        recording = recording_of_arrivals(streams, unit)
     shape, fields, fixed = _known(given, pulse)
-    described = look_at(recording)
+    described = Calibration(look_at(recording), recording, level=alpha)
     if look:
-        return Calibration(described, {}, float("nan"), (), (), None, None, None, None, None, recording, None, alpha)
+        return described
     if recording.photons < LEAST_PHOTONS:
         raise ValueError(
             f"times must hold at least {LEAST_PHOTONS} registrations to be calibrated, got {recording.photons}; "
             "look=True describes a shorter recording"
         )
-    if described.same_time > _SAME_TIME * recording.photons and described.unit_ns == 0.0:
+    same_time = described.look.same_time
+    if same_time > _SAME_TIME * recording.photons and recording.clock.unit_ns == 0.0:
         raise ValueError(
-            f"times must be of photons one after the other, got {described.same_time:,} of {recording.photons:,} at "
+            f"times must be of photons one after the other, got {same_time:,} of {recording.photons:,} at "
             "exactly the time of the one before"
         )
-    return _Run(recording, described, shape, number, fields, fixed, alpha, start_seed).result()
-
-
-def _recorded(times: Any, pooled: bool, unit_ns: float) -> Recording:
-    """The recording of streams, or of an array of times without a laser."""
-    streams = isinstance(times, Sequence) and len(times) > 0 and all(isinstance(t, Timestamps) for t in times)
-    if streams or isinstance(times, Timestamps):
-        return recording_of(times, pooled=pooled)
-    return recording_of_arrivals(times, unit_ns)
+    model = _model(recording, shape, number, fields, "jitter" in fixed)
+    return _Run(described, model, fixed, start_seed).result()
 
 
 def _known(
     given: System | Detector | Mapping[str, Any] | None, pulse: Pulse | str
 ) -> tuple[Pulse | str, dict[str, Any], dict[str, float]]:
     """Shape of the pulse, fields of the detector, and fixed parameters, from what is given."""
-    if isinstance(pulse, str):
-        checks.choice("pulse", pulse, ("gaussian", "free"))
-    elif not isinstance(pulse, Pulse):
-        raise TypeError(f"pulse must be a Pulse, 'gaussian' or 'free', got {pulse!r}")
     if isinstance(given, System):
-        return _known(given.detector, given.pulse if pulse == "gaussian" else pulse)
+        pulse = given.pulse if pulse == "gaussian" else pulse
+        given = given.detector
     if isinstance(given, Detector):
-        return pulse, *_of_detector(given)
-    if given is None:
-        return pulse, {}, {}
-    known = dict(checks.known_keys("given", given, GIVEN))
-    fixed: dict[str, float] = {}
-    if "pulse_sigma_ns" in known:
-        sigma = checks.real("pulse_sigma_ns", known.pop("pulse_sigma_ns"), low=0.0, strict_low=True)
+        fields = _of_detector(given)
+    else:
+        fields = dict(checks.known_keys("given", {} if given is None else given, GIVEN))
+    if "pulse_sigma_ns" in fields:
+        sigma = checks.real("pulse_sigma_ns", fields.pop("pulse_sigma_ns"), low=0.0, strict_low=True)
         if pulse != "gaussian":
             raise ValueError("give the pulse once: pulse or pulse_sigma_ns")
         pulse = GaussianPulse(sigma_ns=sigma)
-    if "dead_time_ns" in known:
-        fixed["dead_time_ns"] = checks.real("dead_time_ns", known.pop("dead_time_ns"), low=0.0)
-    if "jitter_ns" in known:
-        fixed["jitter"] = checks.real("jitter_ns", known.pop("jitter_ns"), low=0.0)
-    probability, delay = known.pop("afterpulse_probability", None), known.pop("afterpulse_delay_ns", None)
+    if fields.get("mode") in ("synchronous", "gated"):
+        raise ValueError(f"given must be a free-running detector, got mode {fields['mode']!r}")
+    names = {"dead_time_ns": "dead_time_ns", "jitter_ns": "jitter"}  # of the options and of the parameters
+    fixed = {own: checks.real(name, fields.pop(name), low=0.0) for name, own in names.items() if name in fields}
+    probability, delay = fields.pop("afterpulse_probability", None), fields.pop("afterpulse_delay_ns", None)
     if (probability is None) != (delay is None):
         raise ValueError("afterpulse_probability and afterpulse_delay_ns belong together: give both, or neither")
     if probability is not None:
-        known["afterpulsing"] = Afterpulsing(probability=float(probability), delay_ns=float(delay))
-    Detector(dead_time_ns=fixed.get("dead_time_ns", known.get("twilight_ns", 0.0)), **known)  # checks the fields
-    return pulse, known, fixed
+        fields["afterpulsing"] = Afterpulsing(probability=probability, delay_ns=delay)
+    Detector(dead_time_ns=fixed.get("dead_time_ns", fields.get("twilight_ns", 0.0)), **fields)  # checks the fields
+    return pulse, fields, fixed
 
 
-def _of_detector(detector: Detector) -> tuple[dict[str, Any], dict[str, float]]:
-    if detector.mode not in ("nonparalyzable", "paralyzable"):
-        raise ValueError(f"given must be a free-running detector, got mode {detector.mode!r}")
+def _of_detector(detector: Detector) -> dict[str, Any]:
+    """What a detector gives: dead time, standard deviation of the jitter, and fields that are not as by default."""
     for name in ("crosstalk", "max_events_per_exposure", "code_density"):
         if name in detector.effects:
             raise ValueError(f"given must not have {name}: the stream of one pixel does not show it")
     bare = detector.without(*LIGHT_EFFECTS)
-    fixed = {"dead_time_ns": bare.dead_time_ns, "jitter": 0.0}
-    fields: dict[str, Any] = {"mode": bare.mode} if bare.mode != "nonparalyzable" else {}
-    for name in bare.effects:
-        if name == "jitter" and isinstance(bare.jitter, Jitter) and bare.jitter.tail_fraction == 0.0:
-            fixed["jitter"] = bare.jitter.std_ns
-        else:
-            fields[name] = getattr(bare, name)
-    return fields, fixed
+    given = {"dead_time_ns": bare.dead_time_ns, "jitter_ns": 0.0}
+    if isinstance(bare.jitter, Jitter) and bare.jitter.tail_fraction == 0.0:
+        given["jitter_ns"], bare = bare.jitter.std_ns, bare.without("jitter")
+    mode = {"mode": bare.mode} if bare.mode != "nonparalyzable" else {}
+    return given | mode | {name: getattr(bare, name) for name in bare.effects}
+
+
+def _model(recording: Recording, shape: Pulse | str, returns: int, fields: dict[str, Any], jitter_given: bool) -> Model:
+    """The model of a recording: light of any shape, returns with a laser, or constant light."""
+    model = Model(recording.clock, 0, fields=tuple(fields.items()), jitter_given=jitter_given)
+    pulse = shape if isinstance(shape, Pulse) else None
+    if pulse is not None:
+        pulse.check(recording.period_ns)
+    if shape == "free":
+        fine = recording.photons >= Effort.bin_photons * Effort.light_bins
+        light = start.free_waveform(recording, Effort.light_bins if fine else Effort.shape_bins)
+        return replace(model, waveform=Waveform(*light, recording.exposure, recording.period_ns, fine))
+    return replace(model, returns=returns, pulse=pulse) if recording.laser else model
 
 
 @dataclass(eq=False)
 class _Run:
-    """One calibration: the model, its fit, and what follows from it."""
+    """One calibration: the recording as described, its model without effects, and parameters of known value."""
 
-    recording: Recording
-    look: Look
-    shape: Pulse | str
-    returns: int
-    fields: dict[str, Any]
+    described: Calibration
+    model: Model
     fixed: dict[str, float]
-    level: float
     seed: int
-    wave: tuple[FloatArray, FloatArray] | None = None
-    most: float = np.inf  # 95 % upper limit of the signal in a pulse, where none is significant
-
-    def __post_init__(self) -> None:
-        recording, shape = self.recording, self.shape
-        self.fit = Fit(recording, Effort(), (self.seed, 0))
-        if isinstance(shape, Pulse):
-            shape.check(recording.period_ns)
-        fields, given = tuple(self.fields.items()), "jitter" in self.fixed
-        model = pulsed = Model(recording.clock, 0, fields=fields, jitter_given=given)
-        if shape == "free":
-            self.wave = start.free_waveform(recording, self.fit.effort.shape_bins)
-            fine = recording.photons >= self.fit.effort.bin_photons * self.fit.effort.light_bins
-            light = start.free_waveform(recording, self.fit.effort.light_bins) if fine else self.wave
-            waveform = Waveform(*light, recording.exposure, recording.period_ns, fine)
-            model = pulsed = replace(model, waveform=waveform)
-        elif recording.laser:
-            p, self.most = start.brightest_window(recording)
-            pulsed = replace(model, returns=self.returns, pulse=shape if isinstance(shape, Pulse) else None)
-            model = pulsed if p <= FALSE_ALARM else model
-        self.model, self.pulsed = model, pulsed
 
     def result(self, attempt: int = 0) -> Calibration:
         """The fit, the effects that it includes, and the suspects that remain.
 
-        A fit that is clearly rejected with every effect may be a local minimum: another one is used if it fits.
+        A fit that is rejected with every effect may be a local minimum: one by other streams is used if it fits.
         """
-        fitted = self.first(attempt)
-        wrong = () if fitted.converged and fitted.p_value >= self.level else self.wrong_values(fitted)
-        included: list[Named] = []
-        drift = suspects.drift(self.fit, fitted) if fitted.converged else None
+        fit, fitted = self.first(attempt)
+        wrong = [] if self.accepts(fitted) else self.wrong_values(fitted)
+        drift = suspects.drift(fit, fitted) if fitted.converged else None
+        included: list[tuple[Score, float]] = []
         trials: list[Trial] = []
-        if fitted.converged and not wrong and not (drift is not None and drift.flickers):  # which looks like effects
-            fitted, included, trials = suspects.search(self.fit, fitted)
-            drift = suspects.drift(self.fit, fitted) if included else drift
-        out = self.assembled(fitted, included, trials, drift, wrong)
-        if attempt == 0 and not included and not wrong and fitted.p_value < suspects.MISFIT * FALSE_ALARM:
-            other = self.result(self.fit.effort.attempts)
-            return other if other.fits else out
-        return out
+        if fitted.converged and not wrong and not (drift and drift.flickers):  # which looks like effects
+            fitted, included, trials = suspects.search(fit, fitted)
+            drift = suspects.drift(fit, fitted) if included else drift
+        if attempt == 0 and not included and not wrong and fitted.p_value < FALSE_ALARM:
+            other = self.result(Effort.attempts)
+            if other.fits:
+                return other
+        return self.assembled(fitted, included, trials, drift, wrong)
 
-    def wrong_values(self, fitted: Fitted) -> tuple[Suspect, ...]:
+    def accepts(self, fitted: Fitted) -> bool:
+        """Whether a fit converged and is not rejected."""
+        return fitted.converged and fitted.p_value >= self.described.level
+
+    def wrong_values(self, fitted: Fitted) -> list[Suspect]:
         """Given values that the stream contradicts (without one of them it fits), and the estimate of each."""
         out = []
-        pulse = {"pulse_sigma_ns": self.shape.sigma_ns if isinstance(self.shape, GaussianPulse) else self.shape}
-        known: dict[str, Any] = {**self.fixed, **self.fields, **(pulse if isinstance(self.shape, Pulse) else {})}
+        pulse = self.model.pulse
+        known: dict[str, Any] = {**self.fixed, **dict(self.model.fields)}
+        if pulse is not None:
+            known["pulse_sigma_ns"] = pulse.sigma_ns if isinstance(pulse, GaussianPulse) else pulse
         for own, given in known.items():
-            fields, fixed = ({k: v for k, v in part.items() if k != own} for part in (self.fields, self.fixed))
-            shape = "gaussian" if own == "pulse_sigma_ns" else self.shape
-            name = "jitter_ns" if own == "jitter" else own
-            run = _Run(self.recording, self.look, shape, self.returns, fields, fixed, self.level, self.seed)
-            free = run.first()
-            if not free.converged or free.p_value < self.level:
+            fixed = {name: value for name, value in self.fixed.items() if name != own}
+            fields = tuple(item for item in self.model.fields if item[0] != own)
+            shape = None if own == "pulse_sigma_ns" else pulse
+            model = replace(self.model, pulse=shape, fields=fields, jitter_given="jitter" in fixed)
+            _, free = replace(self, model=model, fixed=fixed).first()
+            if not self.accepts(free):
                 continue
-            at = _estimates(free, np.ones(free.model.size)).get(name, Estimate(np.nan, np.nan, np.nan, np.nan))
+            name = "jitter_ns" if own == "jitter" else own
+            at = _estimates(free).get(name, Estimate())
             printed = f"{given:g}" if isinstance(given, float) else str(given)
-            gain = fitted.misfit_z - free.misfit_z if fitted.converged else float("nan")
+            gain = fitted.misfit_z - free.misfit_z if fitted.converged else np.nan
             z = abs(at.value - given) / at.error if isinstance(given, float) and at.error > 0.0 else 0.0
             words = f"given {name} = {printed}, where the stream has"
-            option = f"leave it out, and p = {free.p_value:.2g}"
-            out.append(Suspect(words, z, at.value, at.error, gain, option, included=False))
-        return tuple(out)
+            out.append(Suspect(words, z, at.value, at.error, gain, f"leave it out, and p = {free.p_value:.2g}"))
+        return out
 
-    def first(self, attempt: int = 0) -> Fitted:
+    def first(self, attempt: int = 0) -> tuple[Fit, Fitted]:
         """The fit without effects by the streams of an attempt, and of further ones until a pulse is significant.
 
         Where the phases have a bright window, a fit without a pulse is a bad one. Light without a pulse is tried first
         where they have none, and must not be rejected.
         """
-        tried: list[tuple[bool, bool, Fit, Fitted]] = []
-        while len(tried) < self.fit.effort.attempts and not (tried and tried[-1][0] and tried[-1][1]):
-            self.fit = Fit(self.recording, Effort(), (self.seed, attempt + len(tried)))
-            fitted = self._attempt()
-            dark = self.model.returns < self.pulsed.returns and fitted.p_value < FALSE_ALARM
-            tried.append((fitted.converged, fitted.lit and not dark, self.fit, fitted))
-            self.model = self.pulsed
-        *_, self.fit, fitted = max(tried, key=lambda each: each[:2])
-        return fitted
+        recording, tried = self.described.recording, []
+        for number in range(attempt, attempt + Effort.attempts):
+            fit = Fit(recording, Effort(), (self.seed, number))
+            dark = number == 0 and self.model.returns > 0 and start.brightest_window(recording)[0] > FALSE_ALARM
+            fitted = self._attempt(fit, replace(self.model, returns=0, pulse=None) if dark else self.model)
+            good = fitted.converged, fitted.lit and not (dark and fitted.p_value < FALSE_ALARM)
+            tried.append((good, fit, fitted))
+            if all(good):
+                break
+        _, fit, fitted = max(tried, key=lambda each: each[0])
+        return fit, fitted
 
-    def _attempt(self) -> Fitted:
+    def _attempt(self, fit: Fit, model: Model) -> Fitted:
         """A fit with the simulated streams of `fit`."""
-        fit, model = self.fit, self.model
-        tried = []
-        begin = start.starts(fit, self.recording, model, self.fixed)
-        known = {*self.fixed, *(["width"] if model.returns == 0 or model.pulse is not None else [])}
+        known = {*self.fixed} if model.gaussian else {*self.fixed, "width"}
         free = np.array([k for k, name in enumerate(model.names) if name not in known], np.intp)
-        first, photons = fit.effort.first, float(self.recording.photons)
-        for _, theta in begin[:2]:
+        first, photons = fit.effort.first, float(fit.recording.photons)
+        tried = []
+        for _, theta in start.starts(fit, model, self.fixed)[:2]:
             trial = Guess(model, theta, np.diag(0.5 * model.scale(theta)[free]), free)
             tried.append(fit.steps(trial, min(photons, first)))
         guess, _, settled = min(tried, key=lambda trial: trial[1])
@@ -488,196 +471,194 @@ class _Run:
             more = 6.0 if settled else 1.0
             guess, _, settled = fit.steps(guess._replace(root=guess.root / more**0.5), photons, more * first)
         final = fit.finish(guess)
-        return replace(final, converged=final.converged and (settled or final.p_value >= self.level))
+        return replace(final, converged=final.converged and (settled or final.p_value >= self.described.level))
 
     def assembled(
         self,
         fitted: Fitted,
-        included: list[Named],
+        included: list[tuple[Score, float]],
         trials: list[Trial],
         drift: Drift | None,
-        wrong: tuple[Suspect, ...],
+        wrong: list[Suspect],
     ) -> Calibration:
         """The result of the last fit."""
-        growth = _growth(fitted, drift)
-        estimates = _estimates(fitted, growth)
-        if self.most < np.inf and fitted.model.returns < 2 and not (fitted.model.returns and fitted.lit):
-            signal = min(float(fitted.theta[1]), self.most) if fitted.model.returns else 0.0
+        model, recording = fitted.model, self.described.recording
+        centre = model.bounded(fitted.theta)
+        estimates = _estimates(fitted, drift) if fitted.converged else {}
+        if estimates and self.model.returns and model.returns < 2 and not (model.returns and fitted.lit):
+            _, most = start.brightest_window(recording)
+            signal = min(float(fitted.theta[1]), most) if model.returns else 0.0
             words = "no significant pulse: upper limit of one anywhere"
-            estimates["signal"] = Estimate(signal, np.nan, 0.0, self.most, words, 0.0, self.most)
-        named: list[Suspect] = list(wrong)
-        for refit in included:
-            name = refit.effect.names[0]
+            estimates["signal"] = Estimate(signal, np.nan, 0.0, most, words)
+        named = [*wrong]
+        for score, gain in included:
+            name = score.effect.names[0]
             printed = "electronics_dead_time_ns" if name == "electronics_excess" else name
-            at = estimates.get(printed, Estimate(np.nan, np.nan, np.nan, np.nan))
-            words, option = refit.effect.words, f"given {printed}"
-            named.append(Suspect(words, refit.z, at.value, at.error, refit.gain, option, included=True))
+            at, option = estimates.get(printed, Estimate()), f"given {printed}"
+            named.append(Suspect(score.effect.words, score.z, at.value, at.error, gain, option, included=True))
         p = fitted.p_value if fitted.converged else 0.0
         if drift is not None:
             p = min(1.0, 2.0 * min(p, drift.probability))
-            option = "calibrate parts of the recording; the errors include the scatter of the parts"
-            for k in np.flatnonzero(drift.drifts):
-                change = drift.change[k] / (drift.values[:, k].mean() if k == 0 else 1.0)
-                words = "drift of the light, relative" if k == 0 else f"drift of {drift.names[k]}, ns"
-                error = abs(drift.change[k] / drift.trend[k]) * abs(change / drift.change[k])
-                named.append(Suspect(words, abs(drift.trend[k]), change, error, np.nan, option, included=False))
-            if drift.flickers:
-                words = "flicker of the light, counts relative"
-                named.append(Suspect(words, drift.flicker_z, drift.flicker, np.nan, np.nan, option, included=False))
-        if p < min(self.level, FALSE_ALARM) and not any(not suspect.included for suspect in named):
-            worst, z = _worst_cells(fitted)
-            advice = "pulse='free', or returns=2" if worst.startswith("phases") else "no option of the model"
-            named.append(Suspect(worst, z, np.nan, np.nan, np.nan, advice, included=False))
-        centre = fitted.model.bounded(fitted.theta)
-        cycles = int(np.clip(self.recording.exposure, 1, TOL.cycles))
-        wave, error = self.wave or (None, None)
-        if wave is not None and error is not None:
-            wave, error = (float(centre[0] / wave.sum()) * part for part in (wave, error))
+            named += _changes(drift)
+        if p < min(self.described.level, FALSE_ALARM) and all(suspect.included for suspect in named):
+            named.append(_worst_cells(fitted))
         others = [trial for trial in trials if fitted.p_value >= FALSE_ALARM and not trial.refuted]
         limits = tuple(_limit(trial, estimates, drift) for trial in others)
-        for limit in limits:
-            for name, (low, high) in limit.ranges.items():
-                at = estimates[name]
-                estimates[name] = replace(at, least=min(at.least, low), most=max(at.most, high))
-        estimates = estimates if fitted.converged else {}
-        known = bool(estimates) and self.recording.laser
-        system = fitted.model.system(centre, cycles, 1024) if known else None
-        flux = fitted.model.flux(centre) if known else None
-        ordered = tuple(sorted(named, key=lambda suspect: (not suspect.included, -suspect.z)))
-        look, recording = self.look, self.recording
-        return Calibration(
-            look, estimates, p, ordered, limits, drift, system, flux, wave, error, recording, fitted, self.level
+        for name, own in estimates.items():
+            ranges = [(own.low, own.high), *(limit.ranges[name] for limit in limits if name in limit.ranges)]
+            lows, highs = zip(*ranges, strict=True)
+            estimates[name] = replace(own, least=min(lows), most=max(highs))
+        cycles, known = int(np.clip(recording.exposure, 1, TOL.cycles)), fitted.converged and recording.laser
+        light = start.free_waveform(recording, Effort.shape_bins) if model.waveform else None
+        wave, error = (float(centre[0] / light[0].sum()) * part for part in light) if light else (None, None)
+        return replace(
+            self.described,
+            estimates=estimates,
+            p_value=p,
+            suspects=tuple(sorted(named, key=lambda suspect: (not suspect.included, -suspect.z))),
+            limits=limits,
+            drift=drift,
+            system=model.system(centre, cycles, 1024) if known else None,
+            flux=model.flux(centre) if known else None,
+            waveform=wave,
+            waveform_error=error,
+            fitted=fitted,
         )
 
 
-def _growth(fitted: Fitted, drift: Drift | None) -> FloatArray:
-    """Factor (p,) on the errors: of the light, scatter of the parts of the recording over their errors; else 1."""
-    out = np.ones(fitted.model.size)
-    if drift is None:
-        return out
-    for k, name in enumerate(drift.names):
-        if drift.drifts[k] or (k == 0 and drift.flickers):
-            which = [i for i, own in enumerate(fitted.model.names[: fitted.model.light]) if (own == name) or k == 0]
-            out[which] = np.maximum(out[which], drift.growth[k])
+def _changes(drift: Drift) -> list[Suspect]:
+    """The parameters that are not constant, and flicker."""
+    out = []
+    option = "calibrate parts of the recording; the errors include the scatter of the parts"
+    for k in np.flatnonzero(drift.drifts):
+        change = drift.change[k] / (drift.values[:, k].mean() if k == 0 else 1.0)
+        words = "drift of the light, relative" if k == 0 else f"drift of {drift.names[k]}, ns"
+        error = abs(drift.change[k] / drift.trend[k]) * abs(change / drift.change[k])
+        out.append(Suspect(words, abs(drift.trend[k]), change, error, option=option))
+    if drift.flickers:
+        out.append(Suspect("flicker of the light, counts relative", drift.flicker_z, drift.flicker, option=option))
     return out
 
 
-def _estimates(fitted: Fitted, growth: FloatArray) -> dict[str, Estimate]:
-    """Estimates by name: the most probable values, with errors and intervals of draws; errors grow by `growth` (p,)."""
-    model = fitted.model
-    scale = growth[fitted.free]
-    covariance = fitted.covariance * np.outer(scale, scale)
-    drawn = draws(model, fitted.unbounded, covariance, fitted.free)
-    centre, names = model.bounded(fitted.theta), model.names
-    k = model.light
-    free = {names[i] for i in fitted.free}
-    grown = dict(zip(names, growth > 1.0, strict=True))  # the scatter of the parts includes a misfit
-    misfit = "of a model that does not fit: no error is stated"
-    withheld = {name: misfit for name in names if fitted.p_value < FALSE_ALARM and not grown[name]}
-    errors = dict(zip(fitted.free.tolist(), np.sqrt(np.diag(covariance)), strict=True))
-    if not withheld and not fitted.lit:  # there may be another pulse
-        dark = "no significant pulse: no error is stated"
-        withheld |= dict.fromkeys((*names[:k], "width", "jitter"), dark)
-    if model.waveform is not None and "jitter" in free:  # which the shape follows
-        withheld.setdefault("jitter", "beside light of free shape: no error is stated")
-    extremes = _at_bounds(fitted, covariance, drawn) if model.split and "jitter" in free else []
-    out: dict[str, Estimate] = {}
-
-    def put(name: str, value: float, sample: FloatArray, *needs: str, note: str = "", limit: bool = False) -> None:
-        if not free & set(needs):
-            out[name] = Estimate(value, 0.0, value, value, "given")
-            return
-        if not withheld.keys().isdisjoint(needs):
-            out[name] = Estimate(value, np.nan, np.nan, np.nan, next(withheld[own] for own in needs if own in withheld))
-            return
-        # near a bound of the angle the interval also covers the draws next to it
-        parts = [sample, *(sample[rows] for rows in extremes)]
-        ends = [np.quantile(part, (0.025, 0.975)) for part in parts]
-        low, high = (0.0, np.quantile(sample, 0.95)) if limit else (np.min(ends), np.max(ends))
-        out[name] = Estimate(value, float(((sample - value) ** 2).mean() ** 0.5), float(low), float(high), note)
-
-    light = names[0] if model.returns else "light"  # all of it
-    put(light, float(centre[0]), drawn[:, 0], names[0])
-    for i in range(1, k):
-        period = model.clock.period_ns
-        value = float(centre[i] % period if names[i].startswith("delay") else centre[i])
-        put(names[i], value, drawn[:, i] + (value - centre[i]), names[i])
-    pulses, jitters = model.widths(drawn)
-    pulse, jitter = map(float, model.widths(centre))
-    note = "not detected" if "jitter" in free and fitted.unbounded[k + 1] < 2.0 * errors[k + 1] else ""
-    if note and model.split and np.quantile(jitters, 0.975) > 0.985 * centre[k]:
-        note = "not identified: any share of the recorded width"
-    if model.gaussian:
-        put("width_ns", float(centre[k]), drawn[:, k], "width")
-        shared = note if note.startswith("not identified") else ""
-        put("pulse_sigma_ns", pulse, pulses, "width", note=shared)
-    put("jitter_ns", jitter, jitters, "jitter", note=note, limit=bool(note))  # equal tails would exclude zero
-    at = k + 3
-    dead, observed = drawn[:, k + 2], float(centre[k + 2])
-    for effect in model.effects:
-        columns = drawn[:, at : at + len(effect.names)].copy()
-        values = centre[at : at + len(effect.names)]
-        if effect.names[0] == "electronics_excess":
-            put("electronics_dead_time_ns", observed, dead, "dead_time_ns")
-            put("dead_time_ns", observed / (1.0 + float(values[0])), dead / (1.0 + columns[:, 0]), "electronics_excess")
-        elif effect.names[0] == "afterpulse_probability":  # in the option's units, with those that the dead time hides
-            after, delay = float(values[0]), float(np.exp(values[1]))
-            columns[:, 1] = np.exp(columns[:, 1])
-            carriers = np.array([all_carriers(*each) for each in np.c_[columns, dead]])
-            put("afterpulse_probability", all_carriers(after, delay, observed), carriers, *effect.names)
-            put("afterpulse_delay_ns", delay, columns[:, 1], effect.names[1])
-            put("afterpulses_after_dead_time", after, columns[:, 0], "afterpulse_probability")
-        elif not effect.onoff:
-            put(effect.names[0], float(values[0]), columns[:, 0], effect.names[0])
-        at += len(effect.names)
-    if fitted.by_shortest is not None and "dead_time_ns" not in withheld:
-        value, low, high = fitted.by_shortest
-        out["dead_time_ns"] = Estimate(value, np.nan, low, high, "by the shortest interval alone")
-    elif "dead_time_ns" not in out:
-        put("dead_time_ns", observed, dead, "dead_time_ns")
-    return {name: replace(own, least=own.low, most=own.high) for name, own in out.items()}
-
-
-def _at_bounds(fitted: Fitted, covariance: FloatArray, drawn: FloatArray) -> list[NDArray[np.intp]]:
-    """For each bound of the jitter angle within its 95 % interval: indices of the 5 % of draws next to that bound."""
-    k, order = fitted.model.light + 1, np.argsort(drawn[:, fitted.model.light + 1])
-    reach = 1.96 * float(np.sqrt(np.diag(covariance))[list(fitted.free).index(k)])
-    most = float(fitted.model.bounded(np.where(np.arange(drawn.shape[1]) == k, np.pi, fitted.theta))[k])
-    count, angle = len(order) // 20, float(fitted.unbounded[k])
-    return [part for part, end in ((order[:count], 0.0), (order[-count:], most)) if abs(angle - end) < reach]
+def _worst_cells(fitted: Fitted) -> Suspect:
+    """The group of cells that fits worst."""
+    cells = fitted.batch.cells
+    groups = np.split(np.arange(cells.size), [cells.phases, cells.phases + cells.gap_edges.size + 1])
+    words = ("phases: shape of the light", "intervals", "intervals by phase")
+    advice = ("pulse='free', or returns=2", *["no option of the model"] * 2)
+    worst = Suspect("", -np.inf, option=advice[-1])
+    for name, option, group in zip(words, advice, groups, strict=True):
+        used = group[fitted.offset[group] > 5.0]
+        scale = fitted.fresh[:, used].std(0)
+        drawn = ((fitted.fresh[:, used] / scale) ** 2).sum(1)
+        z = (float(((fitted.rest[used] / scale) ** 2).sum()) - drawn.mean()) / drawn.std()
+        worst = Suspect(name, float(z), option=option) if z > worst.z else worst
+    return worst
 
 
 def _limit(trial: Trial, estimates: dict[str, Estimate], drift: Drift | None) -> Limit:
     """Upper limit of an effect that is not in the result, and the estimates of a fit with it where they differ."""
-    name, words, final = trial.effect.names[0], trial.effect.words, trial.final
+    effect, final = trial.effect, trial.final
     if final is None or final.p_value < FALSE_ALARM:
-        return Limit(name, words, float("nan"))
-    sizes = draws(final.model, final.unbounded, final.covariance, final.free)[:, -len(trial.effect.names)]
-    ranges = {}
-    period = final.model.clock.period_ns
-    for key, other in _estimates(final, _growth(final, drift)).items():
-        own = estimates.get(key, other)
-        turn = period * round((own.value - other.value) / period) if key.startswith("delay") else 0.0
+        return Limit(effect.names[0], effect.words)
+    sizes = draws(final.model, final.unbounded, final.covariance, final.free)[:, -len(effect.names)]
+    period, ranges = final.model.clock.period_ns, {}
+    for name, other in _estimates(final, drift).items():
+        own = estimates.get(name, other)
+        turn = period * round((own.value - other.value) / period) if name.startswith("delay") else 0.0
         low, high = other.low + turn, other.high + turn
         if max(own.low - low, high - own.high) > (own.high - own.low) / 3.92:
-            ranges[key] = low, high
-    return Limit(name, words, float(np.quantile(sizes, 0.95)), ranges)
+            ranges[name] = low, high
+    return Limit(effect.names[0], effect.words, float(np.quantile(sizes, 0.95)), ranges)
 
 
-def _worst_cells(fitted: Fitted) -> tuple[str, float]:
-    """The group of cells that fits worst, in words, and by how many standard deviations."""
-    cells = fitted.batch.cells
-    middle = cells.phases + cells.gap_edges.size + 1
-    names, ends = (
-        ("phases: shape of the light", "intervals", "intervals by phase"),
-        (0, cells.phases, middle, cells.size),
-    )
-    worst, most = "", -np.inf
-    for words, (first, end) in zip(names, pairwise(ends), strict=True):
-        used = np.flatnonzero(fitted.offset[first:end] > 5.0) + first
-        scale = fitted.fresh[:, used].std(0)
-        drawn = ((fitted.fresh[:, used] / scale) ** 2).sum(1)
-        z = (float(((fitted.rest[used] / scale) ** 2).sum()) - drawn.mean()) / drawn.std()
-        if z > most:
-            worst, most = words, float(z)
-    return worst, most
+def _quantities(model: Model, rows: FloatArray) -> dict[str, tuple[FloatArray, str]]:
+    """Quantities (...) that are stated, of parameters (..., p) within the bounds; and the parameter that each needs."""
+    of = dict(zip(model.names, rows.T, strict=True))
+    dead, (pulse, jitter) = of["dead_time_ns"], model.widths(rows)
+    out = {name if model.returns else "light": (of[name], name) for name in model.names[: model.light]}
+    if model.gaussian:
+        out |= {"width_ns": (of["width"], "width"), "pulse_sigma_ns": (pulse, "width")}
+    out["jitter_ns"] = jitter, "jitter"
+    for effect in model.effects:
+        name = effect.names[0]
+        if name == "electronics_excess":
+            out["electronics_dead_time_ns"] = dead, "dead_time_ns"
+            out["dead_time_ns"] = dead / (1.0 + of[name]), name
+        elif name == "afterpulse_probability":  # in the option's units, with those that the dead time hides
+            after, delay = of[name], np.exp(of["log_afterpulse_delay"])
+            out[name] = np.vectorize(all_carriers)(after, delay, dead), name
+            out["afterpulse_delay_ns"] = delay, "log_afterpulse_delay"
+            out["afterpulses_after_dead_time"] = after, name
+        elif not effect.onoff:
+            out[name] = of[name], name
+    out.setdefault("dead_time_ns", (dead, "dead_time_ns"))
+    return out
+
+
+def _estimates(fitted: Fitted, drift: Drift | None = None) -> dict[str, Estimate]:
+    """Estimates by name: most probable values, with errors and intervals of draws, grown by the scatter of parts."""
+    model, names, k = fitted.model, fitted.model.names, fitted.model.light
+    growth = _growth(model, drift)
+    covariance = fitted.covariance * np.outer(growth[fitted.free], growth[fitted.free])
+    drawn = draws(model, fitted.unbounded, covariance, fitted.free)
+    centre = model.bounded(fitted.theta)
+    values, samples = _quantities(model, centre), _quantities(model, drawn)
+    errors = dict(zip([names[i] for i in fitted.free], np.sqrt(np.diag(covariance)).tolist(), strict=True))
+    withheld: dict[str, str] = {}
+    if fitted.p_value < FALSE_ALARM:  # the scatter of the parts includes a misfit
+        still = [name for name, factor in zip(names, growth, strict=True) if not factor > 1.0]
+        withheld = dict.fromkeys(still, "of a model that does not fit: no error is stated")
+    elif not fitted.lit:  # there may be another pulse
+        withheld = dict.fromkeys((*names[:k], "width", "jitter"), "no significant pulse: no error is stated")
+    if model.waveform is not None:  # which the shape follows
+        withheld.setdefault("jitter", "beside light of free shape: no error is stated")
+    notes: dict[str, str] = {}
+    if "jitter" in errors and fitted.unbounded[k + 1] < 2.0 * errors["jitter"]:
+        notes["jitter_ns"] = "not detected"
+        if model.split and np.quantile(samples["jitter_ns"][0], 0.975) > 0.985 * centre[k]:
+            notes = dict.fromkeys(("jitter_ns", "pulse_sigma_ns"), "not identified: any share of the recorded width")
+    # near a bound of the angle the interval also covers the draws next to it
+    covered = [slice(None), *(_at_bounds(fitted, errors["jitter"], drawn) if model.split else ())]
+    out: dict[str, Estimate] = {}
+    for name, (exact, parameter) in values.items():
+        value, sample = float(exact), samples[name][0]
+        if name.startswith("delay"):
+            value = value % model.clock.period_ns
+            sample = sample + (value - float(exact))
+        if parameter not in errors:
+            out[name] = Estimate(value, 0.0, value, value, "given")
+        elif parameter in withheld:
+            out[name] = Estimate(value, note=withheld[parameter])
+        else:
+            ends = [np.quantile(sample[rows], (0.025, 0.975)) for rows in covered]
+            low, high = np.min(ends), np.max(ends)
+            if name == "jitter_ns" and notes:  # equal tails would exclude zero
+                low, high = 0.0, np.quantile(sample, 0.95)
+            error = float(((sample - value) ** 2).mean() ** 0.5)
+            out[name] = Estimate(value, error, float(low), float(high), notes.get(name, ""))
+    if fitted.by_shortest is not None:
+        value, low, high = fitted.by_shortest
+        out["dead_time_ns"] = Estimate(value, np.nan, low, high, "by the shortest interval alone")
+    return out
+
+
+def _growth(model: Model, drift: Drift | None) -> FloatArray:
+    """Factor (p,) on the errors: of the light, scatter of the parts of the recording over their errors; else 1."""
+    out = np.ones(model.size)
+    if drift is None:
+        return out
+    for k, name in enumerate(drift.names):
+        which = slice(model.light) if k == 0 else model.names.index(name)
+        if drift.drifts[k] or (k == 0 and drift.flickers):
+            out[which] = np.maximum(out[which], drift.growth[k])
+    return out
+
+
+def _at_bounds(fitted: Fitted, error: float, drawn: FloatArray) -> list[NDArray[np.intp]]:
+    """For each bound of the jitter angle within its 95 % interval: indices of the 5 % of draws next to that bound."""
+    k = fitted.model.light + 1
+    order, angle = np.argsort(drawn[:, k]), fitted.unbounded[k]
+    most = fitted.model.bounded(np.where(np.arange(drawn.shape[1]) == k, np.pi, fitted.theta))[k]
+    ends = ((order[: order.size // 20], 0.0), (order[-(order.size // 20) :], most))
+    return [part for part, end in ends if abs(angle - end) < 1.96 * error]

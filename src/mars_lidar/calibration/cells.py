@@ -22,10 +22,9 @@ class Cells:
     resolved down to 0.7 counts in the exposure, to locate the end of the dead time.
     """
 
-    def __init__(self, model: Model, theta: FloatArray, pilot: list[FloatArray], photons: float) -> None:
+    def __init__(self, model: Model, theta: FloatArray, pilot: Recording, photons: float) -> None:
         period, unit = model.clock.period_ns, model.clock.unit_ns
-        gaps = np.sort(np.concatenate([np.diff(t) for t in pilot]))
-        phases = np.concatenate(pilot) / period % 1.0
+        gaps, phases = pilot.intervals, pilot.times / period % 1.0
         edges, lit = self._layout(model, theta, phases)
         centre = (np.arange(_PHASES) + 0.5) / _PHASES
         # phases from which the dead time, or a shorter one that electronics' dead time hides, ends in a pulse

@@ -56,8 +56,8 @@ class Effort:
         Effects that are included at most, one after the other.
     parts
         Parts of a recording that are tested for drift: a trend then has 14 degrees of freedom.
-    closely, noise
-        Photons, relative to a batch, of the streams that estimate the score of an effect again, as long as more than
+    closest, noise
+        Most photons, relative to a batch, of the streams that estimate the score of an effect again, where more than
         this share of the square of its change is noise.
     shape_bins, light_bins, bin_photons
         Most bins of free light in the result; and of that from which streams are drawn, if each has so many photons.
@@ -80,7 +80,7 @@ class Effort:
     attempts: int = 3
     effects: int = 2
     parts: int = 16
-    closely: tuple[float, ...] = (4.0, 16.0)
+    closest: float = 16.0
     noise: float = 0.1
     shape_bins: int = 256
     light_bins: int = 1024
@@ -106,8 +106,7 @@ class Guess(NamedTuple):
     law: Batch | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Batch:
+class Batch(NamedTuple):
     """A linear law of the counts about a centre, for an exposure: offset (c,), slope (c, p), weight (c, c)."""
 
     cells: Cells
@@ -134,32 +133,22 @@ class Batch:
         amount = (free == 0) | ((free < model.light) & (free % 2 == 1))
         return np.diag(amount / np.maximum(rise, 1.0 / model.scale(self.centre)[free]) ** 2)
 
-    def estimator(self, free: Index, prior: FloatArray | None = None) -> FloatArray:
+    def estimator(self, free: Index, prior: FloatArray | float = 0.0) -> FloatArray:
         """G (free, c), with an optional prior precision (free, free)."""
         jacobian = self.slope[:, free]
-        information = jacobian.T @ self.weight @ jacobian
-        if prior is not None:
-            information = information + prior
+        information = jacobian.T @ self.weight @ jacobian + prior
         scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
         inverse = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-10) * np.outer(scale, scale)
         return np.asarray(inverse @ jacobian.T @ self.weight)
 
 
-class Counts(NamedTuple):
+def counted(model: Model, cells: Cells, rows: FloatArray, cycles: int, seed: int) -> tuple[FloatArray, FloatArray]:
     """Counts (rows, c) of simulated streams, and the correlation (c, c) of counts in pieces of one stream.
 
-    Pieces have the light of their stream, so that their scatter is noise alone; `freedom` of that correlation.
+    There is a stream for each row of parameters (rows, p); `LIGHTS` rows share a detector. Pieces have the light of
+    their stream, so that their scatter is noise alone.
     """
-
-    total: FloatArray
-    correlation: FloatArray
-    freedom: int
-
-
-def counted(model: Model, cells: Cells, rows: FloatArray, exposure: float, seed: int) -> Counts:
-    """Counts of simulated streams, one for each row of parameters (rows, p); `LIGHTS` rows share a detector."""
-    cycles, pieces = max(2, round(exposure)), Effort.pieces
-    square, totals = np.zeros((cells.size, cells.size)), []
+    square, totals, pieces = np.zeros((cells.size, cells.size)), [], Effort.pieces
     for k in range(0, len(rows), LIGHTS):
         streams = model.streams(rows[k : k + LIGHTS], cycles, seed + k)
         counts = cells.count(streams, pieces, cycles * model.clock.period_ns / pieces)
@@ -167,15 +156,13 @@ def counted(model: Model, cells: Cells, rows: FloatArray, exposure: float, seed:
         off = (counts - counts.mean(1, keepdims=True)).reshape(-1, cells.size)
         square += off.T @ off
     sd = np.sqrt(np.maximum(np.diag(square), 1e-300))
-    return Counts(np.concatenate(totals), square / np.outer(sd, sd), len(rows) * (pieces - 1))
+    return np.concatenate(totals), square / np.outer(sd, sd)
 
 
-def design(
-    model: Model, centre: FloatArray, root: FloatArray, free: Index, seed: int, number: int, widths: int
-) -> FloatArray:
+def design(model: Model, centre: FloatArray, root: FloatArray, free: Index, seed: int, number: int) -> FloatArray:
     """Parameters (streams, p), normal of covariance root root' about the centre; `LIGHTS` rows share a detector.
 
-    Pulses have `widths` different widths, each the mean of a group of those drawn; the jitter makes up for the
+    Pulses have `Effort.widths` different widths, each the mean of a group of those drawn; the jitter makes up for the
     difference.
     """
     random, k = np.random.default_rng(seed), model.light
@@ -189,21 +176,21 @@ def design(
         return np.asarray(np.linalg.qr(z - z.mean(0))[0] * rows**0.5)
 
     rows = np.tile(centre, (number * LIGHTS, 1))
-    detectors = np.repeat(normal(number, int((~varied).sum())), LIGHTS, 0)
-    rows[:, free[order]] += np.c_[detectors, normal(len(rows), int(varied.sum()))] @ lower.T
+    between = np.repeat(normal(number, int((~varied).sum())), LIGHTS, 0)
+    rows[:, free[order]] += np.c_[between, normal(len(rows), int(varied.sum()))] @ lower.T
     rows[:, k : k + 2] = np.abs(rows[:, k : k + 2])
     if model.split:
         rows[:, k + 1] = np.arcsin(np.abs(np.sin(rows[:, k + 1])))
     rows = model.bounded(rows)
     if model.gaussian:
+        detectors = rows.reshape(number, LIGHTS, -1)  # a view
         width, (pulse, jitter) = rows[::LIGHTS, k], model.widths(rows[::LIGHTS])
-        for part in np.array_split(np.argsort(pulse), widths):
+        for part in np.array_split(np.argsort(pulse), Effort.widths):
             mean = pulse[part].mean()
             around = np.sqrt(np.maximum(width[part] ** 2 - mean**2, 0.0)) if model.split else jitter[part]
-            at = (part[:, None] * LIGHTS + np.arange(LIGHTS)).ravel()
-            rows[at, k] = np.repeat(np.hypot(mean, around), LIGHTS)
+            detectors[part, :, k] = np.hypot(mean, around)[:, None]
             if model.split:
-                rows[at, k + 1] = np.repeat(np.arctan2(around, mean), LIGHTS)
+                detectors[part, :, k + 1] = np.arctan2(around, mean)[:, None]
     return rows
 
 
@@ -214,33 +201,12 @@ def root_of(cov: FloatArray) -> FloatArray:
     return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 1e-9)))
 
 
-def least_squares(terms: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Coefficients, residuals, and inverse of the normal matrix, of values (n, ...) on terms (n, t)."""
+def least_squares(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Coefficients, residuals, and inverse of the normal matrix, of values (n, ...) on a constant and on x (n, k)."""
+    terms = np.c_[np.ones(len(x)), x]
     inverse = np.asarray(np.linalg.pinv(terms.T @ terms), np.float64)
     slope = inverse @ terms.T @ y
     return slope, y - terms @ slope, inverse
-
-
-def regression(cells: Cells, theta: FloatArray, centre: FloatArray, counts: Counts, ratio: float, free: Index) -> Batch:
-    """The linear law of counts (streams, c), in units of an exposure `ratio` times as long as theirs."""
-    y = counts.total * ratio
-    x = (theta - centre)[:, free]
-    scale = np.maximum(np.abs(x).max(0), 1e-300)
-    terms = np.c_[np.ones(len(x)), x / scale]
-    fitted, residual, inverse = least_squares(terms, y)
-    freedom = len(y) - terms.shape[1]
-    # a cell that few streams reach has a variance of its own count at least, as Poisson's
-    variance = (residual**2).sum(0) / freedom / ratio
-    variance = np.maximum(variance, 0.25 * y.mean(0) + 0.5 / len(y))
-    strength = fitted[1:] ** 2 / (np.diag(inverse)[1:, None] * variance * ratio)
-    slope = np.zeros((y.shape[1], centre.size))
-    slope[:, free] = (fitted[1:] * np.maximum(0.0, 1.0 - 2.0 / np.maximum(strength, 1e-9)) / scale[:, None]).T
-    off = counts.correlation - np.diag(np.diag(counts.correlation))
-    noise = (1.0 - counts.correlation**2) / counts.freedom
-    # Ledoit and Wolf, J. Multivar. Anal. 88, 365 (2004): shrinking to no correlation
-    shrink = np.clip((noise.sum() - np.trace(noise)) / max((off**2).sum(), 1e-9), 0.02, 0.95)
-    weight = np.linalg.inv((1.0 - shrink) * off + np.eye(len(off))) / np.sqrt(np.outer(variance, variance))
-    return Batch(cells, centre, fitted[0], slope, weight, y, residual, ratio, theta)
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,11 +252,10 @@ def most_probable(model: Model, theta: FloatArray, covariance: FloatArray, free:
         if beyond[worst] == 0.0:
             break
         at_bound[worst] = True
-        fixed, rest = np.flatnonzero(at_bound), np.flatnonzero(~at_bound)
-        off = (model.bounded(theta) - theta)[free[fixed]]
-        gain = covariance[np.ix_(rest, fixed)] @ np.linalg.pinv(covariance[np.ix_(fixed, fixed)])
-        theta[free[rest]] += gain @ off
-        theta[free[fixed]] += off
+        off = (model.bounded(theta) - theta)[free[at_bound]]
+        gain = covariance[np.ix_(~at_bound, at_bound)] @ np.linalg.pinv(covariance[np.ix_(at_bound, at_bound)])
+        theta[free[~at_bound]] += gain @ off
+        theta[free[at_bound]] += off
     return model.bounded(theta)
 
 
@@ -299,23 +264,12 @@ def draws(model: Model, theta: FloatArray, covariance: FloatArray, free: Index) 
 
     If fewer than 200 lie there, all draws are moved to the most probable parameters and clipped.
     """
-    root = root_of(covariance)
     rows = np.tile(theta, (Effort.draws, 1))
-    rows[:, free] += np.random.default_rng(0).standard_normal((Effort.draws, len(free))) @ root.T
+    rows[:, free] += np.random.default_rng(0).standard_normal((Effort.draws, len(free))) @ root_of(covariance).T
     inside = (np.abs(model.bounded(rows) - rows)[:, free] <= 1e-12 * np.abs(theta[free])).all(1)
     if inside.sum() >= 200:
         return rows[inside]
     return model.bounded(rows + most_probable(model, theta, covariance, free) - theta)
-
-
-def _inverse(fisher: FloatArray, prior: FloatArray, root: FloatArray) -> FloatArray:
-    """Covariance from an information, which noise may have made indefinite, and a prior precision.
-
-    The streams lie within `_NEAR` standard errors of the estimate, and no larger error is stated.
-    """
-    values, vectors = np.linalg.eigh(root.T @ fisher @ root)
-    whole = (vectors * np.maximum(values, _NEAR**-2.0)) @ vectors.T + root.T @ prior @ root
-    return np.asarray(root @ np.linalg.inv(whole) @ root.T)
 
 
 class Fit:
@@ -339,51 +293,62 @@ class Fit:
         """Laser periods in which the recording has this many photons."""
         return self.recording.exposure * photons / self.recording.photons
 
+    def streams(self, model: Model, theta: FloatArray, photons: float, number: int = LIGHTS) -> Recording:
+        """Simulated streams of parameters `theta` (p,), each with this many photons of the recording."""
+        return model.streams(np.tile(theta, (number, 1)), max(2, round(self.exposure(photons))), self.next_seed())
+
     def cells(self, model: Model, theta: FloatArray, photons: float) -> Cells:
         """Cells of a law for this many photons, by streams at `theta`."""
-        size = self.exposure(self.effort.of(photons))
-        pilot = model.streams(np.tile(theta, (LIGHTS, 1)), max(2, round(size)), self.next_seed())
-        return Cells(model, theta, [t for t in pilot if t.size > 2], photons)
+        return Cells(model, theta, self.streams(model, theta, self.effort.of(photons)), photons)
 
-    def law(
-        self, guess: Guess, photons: float, cells: Cells | None = None, spread: float | None = None, more: int = 1
-    ) -> Batch:
-        """The linear law of counts about a guess for so many photons; with a given spread, of longer streams."""
+    def law(self, guess: Guess, photons: float, cells: Cells, spread: float, times: float = 1, more: int = 1) -> Batch:
+        """The linear law of counts about a guess for so many photons, by `more` streams, `times` as long."""
         model, theta, root, free, _ = guess
-        size = self.effort.of(photons, 1.0 if spread is None else self.effort.longer)
-        spread = self.effort.spread if spread is None else spread
-        cells = self.cells(model, theta, photons) if cells is None else cells
+        size = self.effort.of(photons, times)
         linear = np.diag(model.scale(theta)[free] ** -2.0)
         precision = np.linalg.inv(spread**2 * photons / size * root @ root.T) + linear
         wide = root_of(np.asarray(np.linalg.inv(precision), np.float64))
-        rows = design(model, theta, wide, free, self.next_seed(), more * self.effort.settings, self.effort.widths)
-        exposure = max(2, round(self.exposure(size)))
-        made = counted(model, cells, rows, exposure, self.next_seed())
-        return regression(cells, rows, theta, made, self.exposure(photons) / exposure, free)
+        rows = design(model, theta, wide, free, self.next_seed(), more * self.effort.settings)
+        cycles = max(2, round(self.exposure(size)))
+        ratio = self.exposure(photons) / cycles
+        totals, correlation = counted(model, cells, rows, cycles, self.next_seed())
+        y, x = totals * ratio, (rows - theta)[:, free]
+        scale = np.maximum(np.abs(x).max(0), 1e-300)
+        fitted, residual, inverse = least_squares(x / scale, y)
+        # a cell that few streams reach has a variance of its own count at least, as Poisson's
+        variance = np.maximum((residual**2).sum(0) / (len(y) - len(fitted)) / ratio, 0.25 * y.mean(0) + 0.5 / len(y))
+        strength = fitted[1:] ** 2 / (np.diag(inverse)[1:, None] * variance * ratio)
+        slope = np.zeros((cells.size, theta.size))
+        slope[:, free] = (fitted[1:] * np.maximum(0.0, 1.0 - 2.0 / np.maximum(strength, 1e-9)) / scale[:, None]).T
+        off = correlation - np.diag(np.diag(correlation))
+        noise = (1.0 - correlation**2) / (len(rows) * (self.effort.pieces - 1))
+        # Ledoit and Wolf, J. Multivar. Anal. 88, 365 (2004): shrinking to no correlation
+        shrink = np.clip((noise.sum() - np.trace(noise)) / max((off**2).sum(), 1e-9), 0.02, 0.95)
+        weight = np.linalg.inv((1.0 - shrink) * off + np.eye(len(off))) / np.sqrt(np.outer(variance, variance))
+        return Batch(cells, theta, fitted[0], slope, weight, y, residual, ratio, rows)
 
     def steps(self, guess: Guess, photons: float, first: float = 0.0) -> tuple[Guess, float, bool]:
         """Gauss-Newton steps for ever more photons, up to `photons`; misfit per cell, and whether they converged."""
         model, theta, root, free, _ = guess
         weighed = float(min(photons, max(first, self.effort.first)))
-        total = float(self.recording.photons)
-        misfit, near = np.inf, False
         for _ in range(self.effort.rounds):
-            law = self.law(Guess(model, theta, root, free), weighed)
-            recorded = law.cells.of(self.recording) * (weighed / total)
+            cells = self.cells(model, theta, weighed)
+            law = self.law(Guess(model, theta, root, free), weighed, cells, self.effort.spread)
+            recorded = cells.of(self.recording) * (weighed / self.recording.photons)
             prior = np.asarray(np.linalg.inv(root @ root.T) / 36.0, np.float64)
             gain = law.estimator(free, prior)
             step = gain @ (recorded - law.offset)
             scatter = law.residual @ gain.T
             cov = scatter.T @ scatter / (len(scatter) - len(free) - 1) / law.ratio + law.one_count(model, free)
-            full = law.slope[:, free].T @ law.weight @ law.slope[:, free] + prior
-            inverse = np.linalg.inv(full)
+            jacobian = law.slope[:, free]
+            inverse = np.linalg.inv(jacobian.T @ law.weight @ jacobian + prior)
             cov = cov + inverse @ prior @ inverse
             size = float(np.sqrt(max(float(step @ prior @ step) * 9.0, 0.0) / len(step)))
             step = step / max(1.0, size / 2.0)
             moved = theta.copy()
             moved[free] += step
             theta = most_probable(model, moved, cov, free)
-            rest = recorded - law.offset - law.slope[:, free] @ step
+            rest = recorded - law.offset - jacobian @ step
             misfit = float(rest @ law.weight @ rest / len(rest)) if size <= 2.0 else np.inf
             near = size < (0.6 if weighed >= photons else 1.5)
             grown = min(photons, weighed * 6.0) if near else weighed
@@ -393,15 +358,13 @@ class Fit:
                 break
             weighed = grown
         whole = near and weighed >= photons
-        return Guess(model, theta, root, free, law if whole else None), misfit, whole
+        return Guess(model, theta, root, free, law if whole and self.effort.more == 1 else None), misfit, whole
 
-    def shortest(self, model: Model, rows: FloatArray) -> tuple[float, Shortest] | None:
-        """Probability of the shortest interval for draws (n, p) of the parameters, and its law; None with effects.
+    def shortest(self, model: Model, rows: FloatArray) -> tuple[float, Shortest]:
+        """Probability of the shortest interval for draws (n, p) of the parameters, and its law, without effects.
 
         The fit counts intervals in cells, without their places within a cell, so that it does not use this interval.
         """
-        if model.effects or model.fields:
-            return None
         k, size = model.light + 2, self.effort.of(float(self.recording.photons))
         parts = np.array_split(rows[np.argsort(rows[:, k - 1])], 2 * LIGHTS)  # of about the same jitter each
         middles = np.array([part[len(part) // 2] for part in parts])
@@ -409,7 +372,7 @@ class Fit:
         law = shortest_law(self.recording, model, middles, cycles, self.next_seed())
         return law.p_value([part[:, k] for part in parts]), law
 
-    def finish(self, guess: Guess, again: bool = True, known: bool = False, finished: bool = False) -> Fitted:
+    def finish(self, guess: Guess, known: bool = False, finished: bool = False, again: bool = True) -> Fitted:
         """The last estimate, with the slope, bias, scatter and misfit that fresh streams around it show.
 
         A guess that is already the result of `finish` has the covariance with which the last streams are drawn.
@@ -418,32 +381,30 @@ class Fit:
         counts, or is more precise, or if counts claim more than intervals can tell. The other parameters are then
         fitted once more at that dead time.
         """
-        model, theta, root, free, law = guess
+        model, centre, root, free, law = guess
         photons, effort = float(self.recording.photons), self.effort
-        closer = effort.spread / effort.more**0.5  # counts near the end of a dead time are linear over short distances
-        prior, middle = model.prior(theta, free)
-        if law is None or effort.more > 1:
-            law = self.law(guess, photons, None, closer, effort.more)
+        prior, middle = model.prior(centre, free)
+        if law is None:
+            closer = effort.spread / effort.more**0.5  # counts near the end of a dead time are linear over short ranges
+            law = self.law(guess, photons, self.cells(model, centre, photons), closer, effort.longer, effort.more)
         nearby = _NEAR * (effort.of(photons, effort.longer) / photons) ** 0.5
         gain = law.estimator(free)
         recorded = law.cells.of(self.recording)
-        centre, size = theta, np.zeros(len(free))
         for trial in range(effort.recentred):
-            near = self.law(Guess(model, centre, root, free), photons, law.cells, nearby)
-            y = near.counts  # of streams near the estimate, in the recording's exposure
-            moved = (near.theta - centre)[:, free]
-            terms = np.c_[np.ones(len(y)), moved]
-            slope, rest, inverse = least_squares(terms, (y - near.offset) @ gain.T)
-            local = slope[1:].T
-            noise = np.atleast_2d(rest.T @ rest) / (len(y) - terms.shape[1])
+            near = self.law(Guess(model, centre, root, free), photons, law.cells, nearby, effort.longer)
+            slope, rest, inverse = least_squares((near.theta - centre)[:, free], (near.counts - near.offset) @ gain.T)
+            freedom, local = len(rest) - len(slope), slope[1:].T
             away = gain @ (recorded - near.offset) - slope[0]
-            information = np.linalg.pinv(noise)
+            information = np.linalg.pinv(rest.T @ rest / freedom)
             there = np.r_[1.0, np.linalg.pinv(local) @ away]  # the place at which the law is used, and its noise there
             for _ in range(2):
                 scale = 1.0 / (1.0 / near.ratio + there @ inverse @ there)
                 # the square of an estimated slope exceeds that of the slope by its variance
                 fisher = scale * (local.T @ information @ local - len(free) * inverse[1:, 1:])
-                cov = _inverse(fisher, prior, root)
+                # noise may have made it indefinite; streams lie within `_NEAR` errors, and no larger one is stated
+                values, vectors = np.linalg.eigh(root.T @ fisher @ root)
+                whole = (vectors * np.maximum(values, _NEAR**-2.0)) @ vectors.T + root.T @ prior @ root
+                cov = root @ np.linalg.inv(whole) @ root.T
                 solve = scale * cov @ local.T @ information
                 there[1:] = solve @ away + cov @ prior @ (middle - centre)[free]
             estimator = solve @ gain
@@ -452,33 +413,34 @@ class Fit:
             raw[free] += there[1:]
             mean = most_probable(model, raw, cov, free)
             size = np.abs((mean - centre)[free]) / np.sqrt(np.diag(cov))
-            if (trial or finished) and (size.max() < 1.0 or trial == effort.recentred - 1):
+            if (trial or finished) and size.max() < 1.0:
                 break
             root = root_of(cov)
             centre = centre + (mean - centre) / max(1.0, float(size.max()) / _NEAR)
         if any(model.names[index].startswith("log_") for index in free):
             raw, cov = _curved(model, free, raw, cov, near, gain, recorded)
             mean = most_probable(model, raw, cov, free)
-        sd = np.sqrt(np.diag(cov))
-        # cells and weights were made at other parameters
-        if again and (np.abs((centre - theta)[free]) > _NEAR * sd).any():
-            return self.finish(Guess(model, centre, root_of(cov), free), False, known)
+        moved = np.abs((near.centre - guess.theta)[free]) / np.sqrt(np.diag(cov))
+        # cells and weights were made at other parameters: what new ones change is an error of laws that are not linear
+        if again and effort.more > 1 and moved.max() > _NEAR:
+            second = self.finish(Guess(model, near.centre, root_of(cov), free), known, again=False)
+            change = (second.theta - mean)[second.free]
+            return replace(second, covariance=second.covariance + np.outer(change, change))
         jacobian = law.slope[:, free] @ local
         # a parameter at a bound cannot move further, so that the projection does not remove counts in its direction
         at_bound = ((model.bounded(mean + 1e-6 * (raw - mean)) == mean) & (raw != mean))[free]
         estimator = estimator - cov[:, at_bound] @ np.linalg.pinv(cov[np.ix_(at_bound, at_bound)]) @ estimator[at_bound]
-        unmoved = recorded - near.offset - jacobian[:, at_bound] @ (mean - centre)[free[at_bound]]
         project = np.eye(len(recorded)) - jacobian @ estimator
-        departure = near.residual * (len(y) / (len(y) - terms.shape[1]) / near.ratio) ** 0.5
+        departure = near.residual * (len(near.residual) / freedom / near.ratio) ** 0.5
         fresh = departure @ project.T
         fresh -= fresh.mean(0)
-        rest = project @ unmoved
-        (z, p), timed = _misfit(rest, fresh, law, near), free == model.light + 2
-        judged, interval = self.shortest(model, draws(model, raw, cov, free)), None
-        if judged is not None:
-            early, shortest = judged
-            dead = shortest.dead_time()
-            if timed.any() and (early < 0.05 or shortest.decides(sd[timed][0])):
+        rest = project @ (recorded - near.offset - jacobian[:, at_bound] @ (mean - near.centre)[free[at_bound]])
+        z, p = _misfit(rest, fresh, law, near)
+        interval = None
+        if not (model.effects or model.fields):
+            early, shortest = self.shortest(model, draws(model, raw, cov, free))
+            dead, timed = shortest.dead_time(), free == model.light + 2
+            if timed.any() and (early < 0.05 or shortest.decides(np.sqrt(np.diag(cov)[timed][0]))):
                 at = mean.copy()
                 at[model.light + 2] = dead[0]
                 own = Guess(model, at, root_of(cov[np.ix_(~timed, ~timed)]), free[~timed])
@@ -492,8 +454,8 @@ class Fit:
                 interval, mean[model.light + 2] = dead, dead[0]
             elif early < FALSE_ALARM:
                 p = min(p, early)
-        law_of_counts, converged = (law, near.offset, estimator, jacobian, rest, departure, fresh), size.max() < _NEAR
-        return Fitted(model, free, mean, cov, raw, *law_of_counts, z, p, bool(converged), interval)
+        counts = estimator, jacobian, rest, departure, fresh
+        return Fitted(model, free, mean, cov, raw, law, near.offset, *counts, z, p, bool(size.max() < _NEAR), interval)
 
 
 def _curved(
@@ -508,22 +470,21 @@ def _curved(
     rows = draws(model, raw, 2.25 * cov, free)
     at, counted = (rows - near.centre)[:, free], (near.counts - near.offset) @ gain.T
 
-    def terms(x: FloatArray) -> FloatArray:
-        return np.asarray(np.c_[np.ones(len(x)), x, x[:, -1:] * x[:, -2:]])
+    def squared(x: FloatArray) -> FloatArray:
+        return np.asarray(np.c_[x, x[:, -1:] * x[:, -2:]])
 
-    law, there = terms((near.theta - near.centre)[:, free]), terms(at)
-    slope, rest, inverse = least_squares(law, counted)
-    scale = (len(law) - law.shape[1]) / (1.0 / near.ratio + np.einsum("ki,ij,kj->k", there, inverse, there))
+    slope, rest, inverse = least_squares(squared((near.theta - near.centre)[:, free]), counted)
+    there = np.c_[np.ones(len(at)), squared(at)]
+    scale = (len(rest) - len(slope)) / (1.0 / near.ratio + np.einsum("ki,ij,kj->k", there, inverse, there))
     off, out = gain @ (own - near.offset) - there @ slope, (rows - raw)[:, free]
     log = np.einsum("ki,ij,kj->k", out, np.linalg.inv(2.25 * cov), out) + len(free) * np.log(scale)
     log -= scale * np.einsum("ki,ij,kj->k", off, np.linalg.inv(rest.T @ rest), off)
     weight = np.exp(0.5 * (log - log.max()))
     if not weight.sum() ** 2 > 200.0 * (weight**2).sum():  # too few effective draws: the linear law is kept
         return raw, cov
-    mean = np.average(at, axis=0, weights=weight)
     theta = near.centre.copy()
-    theta[free] += mean
-    return theta, np.atleast_2d(np.cov(at.T, aweights=weight))
+    theta[free] += np.average(at, axis=0, weights=weight)
+    return theta, np.cov(at.T, aweights=weight)
 
 
 def _misfit(rest: FloatArray, fresh: FloatArray, law: Batch, near: Batch) -> tuple[float, float]:

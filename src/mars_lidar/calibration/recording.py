@@ -14,7 +14,7 @@ from mars_lidar._base.types import ArrayLike, FloatArray, NDArray
 from mars_lidar.light.timestamps import Timestamps
 
 _ON_GRID = 0.02  # units: distance from a tick of the clock that rounding of float64 times over an hour can cause
-FALSE_ALARM = 0.003  # probability that an effect, drift, misfit, other period or pulse is named where there is none
+FALSE_ALARM = 0.002  # probability that an effect, drift, misfit, other period or pulse is named where there is none
 LEAST_PHOTONS = 300  # of a recording or a part of it: with fewer, the counts of the cells do not have a normal law
 
 
@@ -77,11 +77,6 @@ class Recording:
     def intervals(self) -> FloatArray:
         """Intervals (n,) between successive registrations, ns, of all stretches, sorted."""
         return np.sort(np.concatenate([np.diff(piece) for piece in self.pieces]))
-
-    @property
-    def shortest(self) -> float:
-        """The shortest interval, ns."""
-        return float(self.intervals[0])
 
     def counts(self, window: float) -> list[NDArray[np.int64]]:
         """Counts (windows,) of each stretch in its successive windows of `window` periods."""

@@ -67,14 +67,15 @@ class Shortest:
     def narrowest(self, cells: int = 12) -> float:
         """Width of the 95 % interval of the dead time given all intervals that jitter brings near its end.
 
-        Their numbers in cells from the shortest interval on are Poisson; the law with the most information is used.
+        Their numbers in cells from the shortest interval on are Poisson; each law counts as much as its likelihood.
         """
-        places = self.recorded[0] + np.linspace(0.0, 1.0, cells) ** 2 * self.reach
-        ends = self.recorded[0] + self.unit * np.unique(np.round((places - self.recorded[0]) / self.unit))
+        places = np.linspace(0.0, 1.0, cells) ** 2 * self.reach
+        ends = self.recorded[0] + self.unit * np.unique(np.round(places / self.unit))
         numbers = np.diff(np.searchsorted(self.recorded, np.r_[0.0, ends + 0.5 * self.unit]))
         below = np.array([self.expected(end) for end in (ends[0] - self.unit, *ends)])
         log = (numbers[:, None, None] * np.log(np.maximum(np.diff(below, axis=0), 1e-300))).sum(0) - below[-1]
-        return min(high - low for _, low, high in (self._interval(np.exp(row - row.max())) for row in log))
+        _, low, high = self._interval(np.exp(log - log.max()).sum(0))
+        return high - low
 
     def _interval(self, likely: FloatArray) -> tuple[float, float, float]:
         share = np.r_[0.0, np.cumsum(0.5 * (likely[1:] + likely[:-1]) * np.diff(self.dead))]
@@ -82,17 +83,16 @@ class Shortest:
         return float(middle), float(low), float(high)
 
 
-def shortest_law(
-    recording: Recording, model: Model, rows: FloatArray, cycles: int, seed: int, bins: int = 2**14, nodes: int = 2000
-) -> Shortest:
+def shortest_law(recording: Recording, model: Model, rows: FloatArray, cycles: int, seed: int) -> Shortest:
     """The law of the shortest interval as a function of the dead time, for each row of parameters (laws, p).
 
-    The phases of registrations are those of streams of `cycles` periods, the light has `bins` bins in a period, and the
-    dead times lie closest near the shortest interval.
+    The phases of registrations are those of streams of `cycles` periods. The dead times lie closest near the shortest
+    interval.
     """
     from scipy.special import ndtr
 
-    period, clock, x = model.clock.period_ns, model.clock, recording.shortest
+    bins, nodes = 2**14, 2000  # of the light in a period; of the dead times on each side of the shortest interval
+    period, clock, x = model.clock.period_ns, model.clock, float(recording.intervals[0])
     middle = np.tile(rows[len(rows) // 2], (len(rows), 1))
     drawn = replace(model, clock=Clock(period)).streams(middle, cycles, seed, jitter=False).times
     phases = np.bincount((drawn / period * bins).astype(np.int64) % bins, minlength=bins) / drawn.size
@@ -103,25 +103,23 @@ def shortest_law(
     sd = np.maximum(2.0**0.5 * model.widths(rows)[1], 1e-6)  # ns, of an interval
     unit = max(clock.unit_ns, 1e-6)
     reach = float(6.0 * sd.max() + unit)
-    near = [gaps[gaps < x + 2.0 * reach] for gaps in map(np.diff, recording.pieces)]
+    near = recording.intervals[: np.searchsorted(recording.intervals, x + 2.0 * reach)]
     early, late = np.linspace(-1.0, 0.0, nodes) ** 3 * x, np.linspace(0.0, 1.0, nodes)[1:] ** 3
     age = x + np.r_[early, late * reach]
+    place = age / period * bins
+    cell = place.astype(np.int64)
+    part = place - cell
+    later = np.maximum(rate[:, cell % bins] * (1.0 - part) + rate[:, (cell + 1) % bins] * part, 0.0)
 
     def up_to(end: float) -> FloatArray:
-        if end < -0.5 * unit:
-            return np.zeros((len(rows), age.size))
+        end = max(end, -0.5 * unit)  # up to which there is none
         return below(end) - below(-end - unit)
 
     def below(end: float) -> FloatArray:
         z = (end - age + np.array([unit, 0.0])[:, None, None]) / sd[:, None]
         above = z * ndtr(z) + np.exp(-0.5 * z**2) / (2.0 * np.pi) ** 0.5  # integral of the normal law
-        share = (above[0] - above[1]) * sd[:, None] / unit
-        place = age / period * bins
-        cell = place.astype(np.int64)
-        part = place - cell
-        at = rate[:, cell % bins] * (1.0 - part) + rate[:, (cell + 1) % bins] * part
-        density = np.maximum(at, 0.0) * share
+        density = later * ((above[0] - above[1]) * sd[:, None] / unit)
         steps = 0.5 * (density[:, 1:] + density[:, :-1]) * np.diff(age)
         return np.asarray(np.c_[np.cumsum(steps[:, ::-1], axis=1)[:, ::-1], np.zeros(len(rows))])
 
-    return Shortest(age, np.sort(np.concatenate(near)), up_to, unit, reach)
+    return Shortest(age, near, up_to, unit, reach)

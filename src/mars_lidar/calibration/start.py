@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mars_lidar._base.types import FloatArray, NDArray
-from mars_lidar.calibration.fit import LIGHTS, Fit
+from mars_lidar._base.types import FloatArray
+from mars_lidar.calibration.fit import Fit
 from mars_lidar.calibration.model import Model
 from mars_lidar.calibration.recording import Clock, Recording
 
@@ -75,51 +75,48 @@ def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
     return np.array([max(faint * bins, 1e-5), *peaks, own**0.5])
 
 
-def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]) -> list[tuple[float, FloatArray]]:
+def starts(fit: Fit, model: Model, fixed: dict[str, float]) -> list[tuple[float, FloatArray]]:
     """(misfit, parameters (p,)) for seven shares of jitter in the recorded width, sorted by the misfit."""
-    k = model.light
+    k, unit, recording = model.light, model.clock.unit_ns, fit.recording
     photons = min(recording.photons, fit.effort.first)
-    t = recording.pieces[0][: 12 * photons]
-    low = np.sort(np.diff(t))
-    observed, unit = low[_ranks(low.size)], model.clock.unit_ns
+    observed, _ = _short_intervals(fit)
     hold = max(4 * observed[-3] - 3 * observed[0], fixed.get("dead_time_ns", 0.0)) + 2 * unit
     if model.returns == 0:
         first = np.array([free_waveform(recording, 64)[0].sum(), max((observed[-3] - observed[0]) / 4, 0.3 * unit)])
     else:
-        first = light(t, model, hold)
+        first = light(recording.pieces[0][: 12 * photons], model, hold)
     trials = []
-    cycles = max(2, round(fit.exposure(photons)))
     # from no jitter to a width of jitter alone
     for angle in np.linspace(0.0, np.pi / 2.0, 1 if "jitter" in fixed else 7):
         theta = np.r_[first, 0.0, 0.0]
         theta[k + 1] = fixed.get("jitter", angle if model.split else np.sin(angle) * theta[k])
-        jitter = float(model.widths(theta)[1])
-        theta[k + 2] = fixed.get("dead_time_ns", max(observed[0], 0.05 * observed[-1]) + 2 * jitter)
+        theta[k + 2] = fixed.get("dead_time_ns", max(observed[0], 0.05 * observed[-1]) + 2 * model.widths(theta)[1])
         if "dead_time_ns" not in fixed:
-            theta = with_edge(fit, model, theta, low)
+            theta = with_edge(fit, model, theta)
         cells = fit.cells(model, theta, photons)
-        rows = cells.count(model.streams(np.tile(theta, (LIGHTS, 1)), cycles, fit.next_seed()))[:, 0]
+        rows = cells.count(fit.streams(model, theta, photons))[:, 0]
         recorded = cells.of(recording) * (photons / recording.photons)
         r = (2 * np.sqrt(recorded + 0.375) - 2 * np.sqrt(rows + 0.375).mean(0)) ** 2
         trials.append((float(r.sum()), theta))
     return sorted(trials, key=lambda pair: pair[0])
 
 
-def _ranks(n: int) -> NDArray[np.intp]:
-    """Ranks of the intervals, of n sorted ones, that are compared at the end of the dead time."""
-    return np.unique(np.minimum([1, 5, 20, max(30, n // 500), max(60, n // 100), max(120, n // 30)], n - 1))
+def _short_intervals(fit: Fit) -> tuple[FloatArray, FloatArray]:
+    """Short intervals of the recording, compared at the end of the dead time, and the share of those below each."""
+    low = np.sort(np.diff(fit.recording.pieces[0][: 12 * fit.effort.first]))
+    n = low.size
+    ranks = np.unique(np.minimum([1, 5, 20, max(30, n // 500), max(60, n // 100), max(120, n // 30)], n - 1))
+    return low[ranks], ranks / n
 
 
-def with_edge(fit: Fit, model: Model, theta: FloatArray, low: FloatArray) -> FloatArray:
-    """Parameters with a dead time at which simulated streams have the smallest intervals of `low` (n,), sorted."""
-    n, k, ranks = low.size, model.light, _ranks(low.size)
-    observed = low[ranks]
-    cycles = max(2, round(fit.exposure(min(fit.recording.photons, fit.effort.first))))
+def with_edge(fit: Fit, model: Model, theta: FloatArray) -> FloatArray:
+    """Parameters with a dead time at which simulated streams have the short intervals of the recording."""
+    k, (observed, shares) = model.light, _short_intervals(fit)
     for _ in range(4):
-        made = model.streams(np.tile(theta, (4, 1)), cycles, fit.next_seed()).intervals
+        made = fit.streams(model, theta, min(fit.recording.photons, fit.effort.first), 4).intervals
         if not made.size:
             break
-        here = made[np.minimum((ranks / n * made.size).astype(int), made.size - 1)]
+        here = made[np.minimum((shares * made.size).astype(int), made.size - 1)]
         theta = theta.copy()
         theta[k + 2] = max(theta[k + 2] + float((observed - here)[1:-1].mean()), 0.05 * observed[0])
     return theta
@@ -132,7 +129,7 @@ def free_waveform(recording: Recording, most: int) -> tuple[FloatArray, FloatArr
     intervals on, where the pixel is certainly armed.
     """
     gaps, clock = recording.intervals, recording.clock
-    low, edge = gaps[min(1, gaps.size - 1)], gaps[max(30, gaps.size // 500) % gaps.size]
+    low, edge = gaps[1], gaps[max(30, gaps.size // 500)]
     hold = float(edge + 3.0 * (edge - low) + 2.0 * clock.unit_ns)
     # whole units of the clock in each bin, if possible; every number divides 0, where the period has no whole units
     bins = max((n for n in range(most // 8, most + 1) if clock.units % n == 0), default=most)

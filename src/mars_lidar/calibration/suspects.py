@@ -4,31 +4,31 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from mars_lidar._base.cached import cached_property
 from mars_lidar._base.types import FloatArray, NDArray
-from mars_lidar.calibration.fit import LIGHTS, Fit, Fitted, Guess, counted, draws, root_of
+from mars_lidar.calibration.fit import LIGHTS, Fit, Fitted, Guess, draws, root_of
 from mars_lidar.calibration.model import Effect, Model, effects
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording
 from mars_lidar.calibration.start import with_edge
 
-MISFIT = 1e-3  # ratio of p-values of two fits of one model (at most 1) below which the lesser is a local minimum
 
-
-@dataclass(frozen=True)
-class Score:
+class Score(NamedTuple):
     """Size of an effect from the residual counts, its standard deviation, and the shift of the parameters.
 
-    `noise`: share of noise in the square of the simulated change, which lowers the score.
+    `along` (c,) the weights of the residual counts; `noise`: share of noise in the square of the simulated change,
+    which lowers the score; `shift` (free,) of the estimates, by an effect of size 1 that the model does not have.
     """
 
     effect: Effect
     size: float
     error: float
+    along: FloatArray
     noise: float
-    shift: FloatArray  # (free,) of the estimates, by an effect of size 1 that the model does not have
+    shift: FloatArray
 
     @property
     def z(self) -> float:
@@ -36,47 +36,66 @@ class Score:
         return min(self.size, 1.0 if self.effect.onoff else np.inf) / max(self.error, 1e-300)
 
 
-def counts_of(
-    fit: Fit, fitted: Fitted, model: Model, theta: FloatArray, times: float = 1.0
-) -> tuple[FloatArray, float]:
-    """Counts that a model expects in the cells of a fit, by `times` a batch; ratio of their variance to them."""
-    photons = float(fit.recording.photons)
-    simulated = times * min(fit.effort.share * photons, fit.effort.batch)
-    exposure = max(2, round(fit.exposure(simulated / LIGHTS)))
-    ratio = fit.exposure(photons) / exposure
-    rows = np.tile(model.bounded(theta), (LIGHTS, 1))
-    return counted(model, fitted.batch.cells, rows, exposure, fit.next_seed()).total.mean(0) * ratio, ratio / LIGHTS
+class Scores:
+    """Scores of further effects of a fitted stream."""
+
+    def __init__(self, fit: Fit, fitted: Fitted) -> None:
+        self.fit, self.fitted = fit, fitted
+        self._plain: dict[float, FloatArray] = {}
+
+    def counts(self, model: Model, theta: FloatArray, times: float = 1.0) -> tuple[FloatArray, float]:
+        """Counts that a model expects in the cells of the fit, by `times` a batch; ratio of their variance to them."""
+        fit, photons = self.fit, float(self.fit.recording.photons)
+        simulated = times * min(fit.effort.share * photons, fit.effort.batch)
+        streams = fit.streams(model, model.bounded(theta), simulated / LIGHTS)
+        ratio = fit.exposure(photons) / streams.cycles[0]
+        return self.fitted.batch.cells.of(streams) / LIGHTS * ratio, ratio / LIGHTS
+
+    def of(self, effect: Effect, theta: FloatArray, times: float = 1.0) -> Score:
+        """Size of an effect by generalised least squares: residual counts along the change that it makes at `theta`.
+
+        From that change the part is removed that the other parameters of the fit can absorb. The noise of the
+        simulated counts makes the size too small on average, and no false score; where much of the change is noise, a
+        score above 1 is estimated again by longer streams, of `times` a batch.
+        """
+        fitted, used, effort = self.fitted, self.fitted.batch.common, self.fit.effort
+        wider = replace(fitted.model, effects=(*fitted.model.effects, effect))
+        size, weight = max(float(theta[fitted.model.size]), 1e-9), fitted.batch.weight[np.ix_(used, used)]
+        if times not in self._plain:
+            self._plain[times] = self.counts(fitted.model, fitted.theta, times)[0]
+        plain, (made, share) = self._plain[times], self.counts(wider, theta, times)
+        change, noise = (made - plain) / size, (plain + made) * share / size**2
+        shift = fitted.estimator @ change
+        way = change - fitted.jacobian @ shift
+        along = np.zeros_like(way)
+        along[used] = weight @ way[used]
+        square = max(float(way @ along), 1e-300)
+        along /= square
+        spread = float((fitted.fresh @ along).std()) * (1.0 + 2.0 * share) ** 0.5
+        part = float(noise[used] @ np.diag(weight)) / square
+        score = Score(effect, float(fitted.rest @ along), spread, along, part, shift)
+        if score.z < 1.0 or part < effort.noise or times > 1.0:
+            return score
+        return self.of(effect, theta, min(effort.closest, np.ceil(part / effort.noise)))
+
+    def limit(self, tested: list[Score]) -> float:
+        """What the largest of these scores exceeds by chance with the probability of a false alarm.
+
+        They are about normal, with the correlations that they have in streams of the fit.
+        """
+        drawn = self.fitted.fresh @ np.array([score.along for score in tested]).T
+        root = root_of(np.corrcoef(drawn, rowvar=False).reshape(len(tested), -1))
+        largest = (np.random.default_rng(0).standard_normal((100_000, len(tested))) @ root.T).max(1)
+        return float(np.quantile(largest, 1.0 - FALSE_ALARM))
 
 
-def _score(
-    fit: Fit, fitted: Fitted, plain: FloatArray, model: Model, theta: FloatArray, effect: Effect, times: float = 1.0
-) -> Score:
-    """Size of an effect by generalised least squares: residual counts along the change that it makes at `theta`.
+def possible(scores: Scores) -> list[Trial]:
+    """Effects that the stream may have beyond the model, one trial of each kind.
 
-    From that change the part is removed that the other parameters of the fit can absorb. The noise of the simulated
-    counts, of `times` a batch as those of `plain`, makes the size too small on average, and no false score.
+    Afterpulses start from the mean delay with the largest score. A paralyzable detector, of size 1, is left out of a
+    stream that fits if the 95 % upper limit of its score is below 1.
     """
-    made, share = counts_of(fit, fitted, model, theta, times)
-    size, used = max(float(theta[fitted.model.size]), 1e-9), fitted.batch.common
-    change, noise = (made - plain) / size, (plain + made) * share / size**2
-    shift = fitted.estimator @ change
-    way = change - fitted.jacobian @ shift
-    along = np.zeros_like(way)
-    along[used] = fitted.batch.weight[np.ix_(used, used)] @ way[used]
-    square = max(float(way @ along), 1e-300)
-    along /= square
-    spread = float((fitted.fresh @ along).std()) * (1.0 + 2.0 * share) ** 0.5
-    part = float(noise[used] @ np.diag(fitted.batch.weight)[used]) / square
-    return Score(effect, float(fitted.rest @ along), spread, part, shift)
-
-
-def possible(fit: Fit, fitted: Fitted, plain: FloatArray) -> list[Trial]:
-    """Effects that the stream may have beyond the `plain` counts of the model, one trial of each kind.
-
-    Afterpulses start from the mean delay with the largest score. Scores above 1 that noise of the simulated change
-    lowers are estimated again by longer streams. A paralyzable detector, of size 1, is left out of a stream that fits
-    if the 95 % upper limit of its score is below 1.
-    """
+    fitted = scores.fitted
     model = fitted.model
     of = {"afterpulsing": "afterpulse_probability", "mode": "paralyzable"}
     have = {of.get(name, name) for name, _ in model.fields} | {*model.names}
@@ -84,59 +103,67 @@ def possible(fit: Fit, fitted: Fitted, plain: FloatArray) -> list[Trial]:
     dead = float(centre[model.light + 2])
     given = model.light + 2 not in fitted.free and fitted.by_shortest is None  # the detector's, not the electronics'
     have |= {"electronics_excess"} if given or "electronics_dead_time_ns" in have else set()
-
-    def scored(effect: Effect, plain: FloatArray, times: float = 1.0) -> Score:
-        wider = replace(model, effects=(*model.effects, effect))
-        return _score(fit, fitted, plain, wider, np.r_[centre, effect.start], effect, times)
-
-    listed: list[Score] = []
+    tested: dict[str, list[Score]] = {}
     for effect in effects(dead) if dead > 0.0 else ():
         if effect.names[0] not in have:
             with suppress(ValueError):  # a detector cannot have both
-                listed.append(scored(effect, plain))
-    listed = [s for s in listed if not s.effect.onoff or fitted.p_value < FALSE_ALARM or s.size + 1.645 * s.error > 1.0]
-    best = {score.effect.names[0]: score for score in sorted(listed, key=lambda score: score.z)}
-    scores = list(best.values())
-    for times in fit.effort.closely:
-        noisy = [score.z > 1.0 and score.noise > fit.effort.noise for score in scores]
-        if any(noisy):
-            plain = counts_of(fit, fitted, model, fitted.theta, times)[0]
-            scores = [scored(s.effect, plain, times) if again else s for s, again in zip(scores, noisy, strict=True)]
-    return [Trial(fit.shorter, fitted, score) for score in scores]
+                score = scores.of(effect, np.r_[centre, effect.start])
+                if not effect.onoff or fitted.p_value < FALSE_ALARM or score.size + 1.645 * score.error > 1.0:
+                    tested.setdefault(effect.names[0], []).append(score)
+    limit = scores.limit([score for own in tested.values() for score in own]) if tested else np.inf
+    largest = [max(own, key=lambda score: score.z) for own in tested.values()]
+    return [Trial(scores.fit, fitted, score, score.z > limit) for score in largest]
 
 
 class Trial:
-    """A further effect, and the fit with it by short batches, made when it is asked for."""
+    """A further effect by its score, and the fit with it, made when it is asked for."""
 
-    def __init__(self, shorter: Fit, fitted: Fitted, score: Score) -> None:
-        self.score, self.effect, self._shorter, self._fitted = score, score.effect, shorter, fitted
+    def __init__(self, fit: Fit, fitted: Fitted, score: Score, clear: bool) -> None:
+        self.fit, self.fitted, self.score, self.effect, self.clear = fit, fitted, score, score.effect, clear
+        self.model = replace(fitted.model, effects=(*fitted.model.effects, self.effect))
 
     @cached_property
-    def final(self) -> Fitted | None:
-        """The fit with the effect, tested by fresh streams; None if no detector can have it, or it did not converge."""
-        fit, fitted, score, effect = self._shorter, self._fitted, self.score, self.effect
-        model = replace(fitted.model, effects=(*fitted.model.effects, effect))
+    def guess(self) -> Guess:
+        """Parameters of the fit without the effect, less what the effect makes of them, and the effect."""
+        fitted, score, effect = self.fitted, self.score, self.effect
         size = effect.start[0]
         moved = fitted.theta.copy()
         if not effect.onoff and score.size > 0.0:
             size = min(score.size, effect.most[0])
             moved[fitted.free] -= score.shift * min(size, effect.start[0])
-        theta = model.bounded(np.r_[moved, size, effect.start[1:]])
-        spread = 0.5 * model.scale(theta)
+        theta = self.model.bounded(np.r_[moved, size, effect.start[1:]])
+        spread = 0.5 * self.model.scale(theta)
         own = np.sqrt(np.diag(fitted.covariance))
         spread[fitted.free] = np.minimum(spread[fitted.free], np.maximum(8.0 * own, 1e-12))
-        more = [] if effect.onoff else range(fitted.model.size, model.size)
+        more = [] if effect.onoff else range(fitted.model.size, self.model.size)
         timed = [] if fitted.by_shortest is None else [fitted.model.light + 2]
         free = np.r_[np.union1d(fitted.free, timed), more].astype(np.intp)
-        photons = float(fit.recording.photons)
+        return Guess(self.model, theta, np.diag(spread[free]), free)
+
+    @cached_property
+    def direct(self) -> Fitted | None:
+        """The fit by full batches from the size that a significant score gives, if it fits; else None."""
+        if not self.clear:
+            return None
+        guess, fitted = self.guess, self.fitted
+        near = np.diag(guess.root).copy()
+        near[np.isin(guess.free, fitted.free)] = np.sqrt(np.diag(fitted.covariance))
+        near[guess.free == fitted.model.size] = self.score.error
+        final = self.fit.finish(guess._replace(root=np.diag(near)))
+        return final if final.converged and final.p_value > FALSE_ALARM else None
+
+    @cached_property
+    def final(self) -> Fitted | None:
+        """The fit with the effect, tested by fresh streams; None if no detector can have it, or it did not converge."""
+        if self.direct is not None:
+            return self.direct
+        fit, guess, photons = self.fit.shorter, self.guess, float(self.fit.recording.photons)
         try:
-            if fitted.model.light + 2 in free:  # the dead time has absorbed part of the effect
-                gaps = np.diff(fit.recording.pieces[0][: 12 * fit.effort.first])
-                theta = with_edge(fit, model, theta, np.sort(gaps))
-            guess = fit.steps(Guess(model, theta, np.diag(spread[free]), free), photons, photons / 6.0)[0]
+            if self.fitted.model.light + 2 in guess.free:  # the dead time has absorbed part of the effect
+                guess = guess._replace(theta=with_edge(fit, self.model, guess.theta))
+            final = fit.finish(fit.steps(guess, photons, photons / 6.0)[0])
         except (ValueError, np.linalg.LinAlgError):
             return None
-        final = fit.finish(guess)
         return final if final.converged else None
 
     @property
@@ -145,69 +172,74 @@ class Trial:
         return self.effect.onoff and self.final is not None and self.final.p_value < FALSE_ALARM
 
 
-@dataclass(frozen=True)
-class Named:
-    """An effect in the result: its score in standard deviations, and the decrease of the misfit, in its own."""
+def search(fit: Fit, fitted: Fitted) -> tuple[Fitted, list[tuple[Score, float]], list[Trial]]:
+    """The fit with the effects that the stream shows, their scores and gains, and the trials of all others.
 
-    effect: Effect
-    z: float
-    gain: float
-
-
-def search(fit: Fit, fitted: Fitted) -> tuple[Fitted, list[Named], list[Trial]]:
-    """The fit with the effects that the stream shows, those effects, and the trials of all others."""
-    included: list[Named] = []
-    for last in (*[False] * fit.effort.effects, True):
-        plain = counts_of(fit, fitted, fitted.model, fitted.theta)[0]
-        trials = possible(fit, fitted, plain)
-        better = None if last else refitted(fit, fitted, plain, trials)
+    A gain is the decrease of the misfit, in its standard deviations.
+    """
+    included: list[tuple[Score, float]] = []
+    for remaining in reversed(range(fit.effort.effects + 1)):
+        scores = Scores(fit, fitted)
+        trials = possible(scores)
+        better = refitted(scores, trials) if remaining and trials else None
         if better is None:
             break
         fitted, effect = better
-        if effect is not None:
-            included.append(effect)
+        included += effect
     return fitted, included, trials
 
 
-def refitted(fit: Fit, fitted: Fitted, plain: FloatArray, trials: list[Trial]) -> tuple[Fitted, Named | None] | None:
+def refitted(scores: Scores, trials: list[Trial]) -> tuple[Fitted, list[tuple[Score, float]]] | None:
     """The fit with the effect that explains most, or a better fit without any; None if no effect is significant.
+
+    Beside the fit with an effect stand the effect's larger score and its gain.
 
     An effect is significant if its refit fits where the model is rejected; or if the refit is not worse and the
     residual counts have a significant score, along the change by a small effect or along that by the effect of the
     refit. (The first alone misleads: a slow recovery has the score of a paralyzable detector, and an effect that the
     dead time has absorbed has none.) Of light of free shape, which follows the recorded phases, only the misfit counts.
-    All refits are by short batches; that with the least misfit is repeated by full ones.
+    Where the refit with the least misfit is by short batches, it is repeated by full ones. The fit without the effect
+    is repeated, too, from the same place and with other streams: where that fits (p > 5 %), the mean of the scores
+    beside both must be significant, since a score has noise of the fit that it stands beside.
     """
-    from scipy.special import ndtri
+    fit, fitted = scores.fit, scores.fitted
+    size = fitted.model.size
 
-    limit, size = float(-ndtri(FALSE_ALARM / max(2 * len(trials), 1))), fitted.model.size  # two scores each
+    def better(final: Fitted) -> bool:
+        return bool(final.theta[size] > 0.0 and final.p_value > min(FALSE_ALARM, fitted.p_value))
 
-    def significance(trial: Trial, final: Fitted | None) -> float:
-        """The score of a significant effect, by a refit; else -inf."""
-        if final is None or not final.theta[size] > 0.0 or final.p_value <= min(FALSE_ALARM, fitted.p_value):
-            return -np.inf
-        z = max(trial.score.z, _score(fit, fitted, plain, final.model, final.theta, trial.effect).z)
-        clear = z > limit and final.model.waveform is None
-        return z if clear or fitted.p_value < FALSE_ALARM < final.p_value else -np.inf
+    refits: list[tuple[Trial, Fitted, Score]] = []
+    for trial in [trial for trial in trials if trial.direct is not None] or trials:
+        final = trial.final
+        if final is not None and better(final):
+            refits.append((trial, final, scores.of(trial.effect, final.theta)))
+    limit = scores.limit([*(trial.score for trial in trials), *(own for *_, own in refits if own.noise < 1.0)])
 
-    significant = [
-        (trial, trial.final) for trial in trials if significance(trial, trial.final) > -np.inf and trial.final
-    ]
-    if not significant:
+    def significant(trial: Trial, final: Fitted, score: Score) -> bool:
+        clear = max(trial.score.z, score.z) > limit and final.model.waveform is None
+        return clear or fitted.p_value < FALSE_ALARM < final.p_value
+
+    chosen = min((each for each in refits if significant(*each)), key=lambda each: each[1].misfit_z, default=None)
+    if chosen is None:
         return None
-    trial, final = min(significant, key=lambda pair: pair[1].misfit_z)
-    if fitted.p_value < MISFIT:  # the first fit may have been a bad one
-        known = final.free < size
-        root = root_of(final.covariance[np.ix_(known, known)])
-        other = fit.shorter.finish(Guess(fitted.model, final.theta[:size], root, final.free[known]))
-        if other.converged and other.p_value > max(FALSE_ALARM, fitted.p_value / MISFIT):
-            fitted, plain = other, counts_of(fit, other, other.model, other.theta)[0]
-            if not _score(fit, fitted, plain, final.model, final.theta, trial.effect).z > limit:
-                return fitted, None
-    last = fit.finish(Guess(final.model, final.theta, root_of(final.covariance), final.free), finished=True)
-    final = last if last.converged else final
-    z = significance(trial, final)
-    return (final, Named(trial.effect, z, fitted.misfit_z - final.misfit_z)) if z > -np.inf else None
+    trial, final, score = chosen
+    # the fit without the effect once more, from the place of the refit: the first one may have been bad
+    known = final.free < size
+    root = root_of(final.covariance[np.ix_(known, known)])
+    other = fit.finish(Guess(fitted.model, final.theta[:size], root, final.free[known]))
+    if other.converged and other.p_value > 0.05:
+        small = np.r_[fitted.model.bounded(other.theta), trial.effect.start]
+        place = small if trial.score.z > score.z else final.theta
+        again = Scores(fit, other).of(trial.effect, place)
+        if not 0.5 * (max(trial.score.z, score.z) + again.z) > limit:
+            return (other, []) if fitted.p_value < FALSE_ALARM else None
+    if trial.direct is None:
+        last = fit.finish(Guess(final.model, final.theta, root_of(final.covariance), final.free), finished=True)
+        if last.converged:
+            final, score = last, scores.of(trial.effect, last.theta)
+    if not (better(final) and significant(trial, final, score)):
+        return None
+    return final, [(max(trial.score, score, key=lambda each: each.z), fitted.misfit_z - final.misfit_z)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,9 +247,10 @@ class Drift:
     """Parameters by parts of the recording.
 
     `times_s` (parts,) their middles; `values` (parts, p), and `errors` (p,) of each; `trend` (p,) change from start to
-    end, in standard deviations; `p_value` (p,) of it or of the scatter, the smaller; `growth` (p,) factor of the
-    scatter on the stated errors; `flicker` relative standard deviation of counts in times shorter than such a part,
-    `flicker_z` its score in standard deviations.
+    end, in standard deviations; `p_value` (p,) of it or of the scatter, the smaller, times the number of tests (of
+    which a trend of the light counts as three quarters of all); `growth` (p,) factor of the scatter on the stated
+    errors; `flicker` relative standard deviation of counts in times shorter than such a part, `flicker_z` its score in
+    standard deviations, `flicker_p` its p-value, times the number of tests.
     """
 
     names: tuple[str, ...]
@@ -230,33 +263,26 @@ class Drift:
     growth: FloatArray
     flicker: float
     flicker_z: float
+    flicker_p: float
 
     @property
     def probability(self) -> float:
         """Probability that a constant recording shows as large a trend, scatter or flicker in any of the parameters."""
-        p = min(float(self.p_value.min()), _above(self.flicker_z))
-        return float(1.0 - (1.0 - p) ** (2 * self.p_value.size + 1))
+        return float(min(1.0, self.flicker_p, *self.p_value))
 
     @property
     def drifts(self) -> NDArray[np.bool_]:
         """(p,) which parameters are not constant."""
-        return np.asarray(self.p_value < FALSE_ALARM / (2 * self.p_value.size + 1))
+        return np.asarray(self.p_value < FALSE_ALARM)
 
     @property
     def flickers(self) -> bool:
         """Whether the light is not constant over shorter times."""
-        return _above(self.flicker_z) < FALSE_ALARM / (2 * self.p_value.size + 1)
+        return self.flicker_p < FALSE_ALARM
 
 
-def _above(z: float) -> float:
-    """Probability of a normal deviate above z."""
-    from scipy.special import ndtr
-
-    return float(ndtr(-z))
-
-
-def _flicker(fit: Fit, fitted: Fitted, counts: float = 8.0, windows: int = 64) -> tuple[float, float, float]:
-    """Relative standard deviation of flickering light, its score, and the factor on the variance of the counts.
+def _flicker(fit: Fit, fitted: Fitted, counts: float = 8.0, windows: int = 64) -> tuple[float, float, float, float]:
+    """Relative standard deviation of flickering light, score, p-value, and the factor on the variance of the counts.
 
     Half the mean squared difference of counts in successive windows (Allan's variance, which a slow drift does not
     change), over that of streams of the fit: for longer windows, relative to the shortest. Afterpulses and other
@@ -264,45 +290,46 @@ def _flicker(fit: Fit, fitted: Fitted, counts: float = 8.0, windows: int = 64) -
     shortest windows have `counts` counts, each further size four times as many, as long as `windows` remain. The noise
     is the larger of that of Poisson counts and the scatter of these streams, whose light is drawn from its errors.
     """
-    from scipy.special import ndtri
+    from scipy.special import ndtr
 
     recording, size = fit.recording, min(float(fit.recording.photons), fit.effort.batch / 4.0)
     cycles = max(2, round(fit.exposure(size)))
     rows = draws(fitted.model, fitted.unbounded, fitted.covariance, fitted.free)[:LIGHTS]
     drawn = [Recording((t,), (cycles,), recording.clock) for t in fitted.model.streams(rows, cycles, 0)]
-    table: list[list[tuple[float, float, float]]] = []
-    while not table or counts * windows < recording.photons:
-        window = counts * recording.exposure / recording.photons
-        table.append([x.unevenness(window) for x in (recording, *drawn)])
-        counts *= 4.0
+    sizes = counts * 4.0 ** np.arange(16)
+    lengths = sizes[sizes * windows < recording.photons] * recording.exposure / recording.photons
+    if lengths.size == 1:
+        return 0.0, -np.inf, 1.0, 1.0
+    table = [[x.unevenness(length) for x in (recording, *drawn)] for length in lengths]
     variance, number, mean = np.maximum(np.array(table).transpose(2, 0, 1), 1e-300)  # (windows, streams) each
     expected = variance[:, 1:].mean(1)
     ratio, even = variance[:, 0] / expected, 3.0 / number[:, 0] + 3.0 / number[:, 1:].sum(1)  # of even counts
-    if len(table) == 1:
-        return 0.0, -np.inf, 1.0
     scatter = np.log(variance[1:, 1:] / variance[0, 1:]).var(1, ddof=1) * number[1:, 1:].mean(1) / number[1:, 0]
     z = np.log(ratio[1:] / ratio[0]) / np.sqrt(np.maximum(even[1:] + even[0], scatter * (1.0 + 1.0 / LIGHTS)))
-    p, excess = min(1.0, z.size * _above(z.max())), np.sqrt(np.maximum(variance[:, 0] - expected, 0.0)) / mean[:, 0]
-    return float(excess[1 + z.argmax()]), float(-ndtri(p)) if p > 0.0 else float(z.max()), float(ratio.max())
+    excess = np.sqrt(np.maximum(variance[:, 0] - expected, 0.0)) / mean[:, 0]
+    largest = int(z.argmax())
+    return float(excess[1 + largest]), float(z[largest]), z.size * float(ndtr(-z[largest])), float(ratio.max())
 
 
 def drift(fit: Fit, fitted: Fitted) -> Drift | None:
     """Light and delay of parts of the recording, with all else constant; None for a short recording."""
-    from scipy.special import chdtrc
+    from scipy.special import chdtrc, ndtr
 
     recording = fit.recording
     number = int(min(fit.effort.parts, recording.photons // LEAST_PHOTONS))
     if number < 4:
         return None
     parts = [part for part in recording.parts(number) if part.photons > 20]
-    model, batch, light = fitted.model, fitted.batch, fitted.free[fitted.free < fitted.model.light]
+    model, batch, scores = fitted.model, fitted.batch, Scores(fit, fitted)
+    light = fitted.free[fitted.free < model.light]
     delays = light[(light > 0) & (light % 2 == 0)]
     # all light in proportion, and each delay; the rest is constant
-    directions = np.zeros((model.size, 1 + delays.size))
+    steps = np.zeros((1 + delays.size, model.size))
     amounts = np.setdiff1d(light, delays)
-    directions[amounts, 0] = fitted.theta[amounts] / fitted.theta[amounts].sum()
-    directions[delays, 1 + np.arange(delays.size)] = 1.0
-    response = fitted.jacobian @ directions[fitted.free]
+    steps[0, amounts] = 0.1 * fitted.theta[amounts]
+    steps[1 + np.arange(delays.size), delays] = 0.5 * model.scale(fitted.theta)[delays]
+    up, down = (np.array([scores.counts(model, fitted.theta + step)[0] for step in way * steps]) for way in (1, -1))
+    response = (0.5 * (up - down) / steps.sum(1)[:, None]).T
     # and the number of registrations, because the weights are noisy
     sums = np.vstack([response.T @ batch.weight, np.arange(len(response)) < batch.cells.phases])
     precision = np.linalg.pinv(np.cov(sums @ fitted.noise.T))
@@ -319,15 +346,17 @@ def drift(fit: Fit, fitted: Fitted) -> Drift | None:
     # parts of a recording with interruptions differ in exposure: weights are their shares
     place = 0.5 * (ends[1:] + ends[:-1]) / ends[-1] - 0.5
     place -= share @ place
-    mean = share @ x
+    x -= share @ x
     spread = float(share @ place**2)
-    slope = (share * place) @ (x - mean) / spread
-    square = (share[:, None] * ((x - mean) / noise) ** 2).sum(0)
+    slope = (share * place) @ x / spread
+    square = (share[:, None] * (x / noise) ** 2).sum(0)
     trend = slope * spread**0.5 / noise
-    p = np.minimum([2.0 * _above(abs(z)) for z in trend], chdtrc(len(parts) - 1, square))
+    others = 8.0 * trend.size  # 2 trend.size tests share a quarter of the level
+    tests = np.where(np.arange(trend.size) == 0, 4.0 / 3.0, others)
+    p = np.minimum(tests * 2.0 * ndtr(-np.abs(trend)), others * chdtrc(len(parts) - 1, square))
     about = np.r_[fitted.theta[amounts].sum(), fitted.theta[delays]]
     growth = np.sqrt(np.maximum(square / (len(parts) - 1), 1.0))
-    flicker, flicker_z, ratio = _flicker(fit, fitted)
+    flicker, flicker_z, flicker_p, ratio = _flicker(fit, fitted)
     growth[0] = max(growth[0], ratio**0.5)
     names = ("light", *(model.names[k] for k in delays))
-    return Drift(names, middle, x - mean + about, sd, trend, slope, p, growth, flicker, flicker_z)
+    return Drift(names, middle, x + about, sd, trend, slope, p, growth, flicker, flicker_z, others * flicker_p)

@@ -424,7 +424,7 @@ class Fit:
         # cells and weights were made at other parameters: what new ones change is an error of laws that are not linear
         if again and effort.more > 1 and moved.max() > _NEAR:
             second = self.finish(Guess(model, near.centre, root_of(cov), free), known, again=False)
-            change = (second.theta - mean)[second.free]
+            change = (second.theta - mean)[second.free] * (not model.effects)  # which start far from their values
             return replace(second, covariance=second.covariance + np.outer(change, change))
         jacobian = law.slope[:, free] @ local
         # a parameter at a bound cannot move further, so that the projection does not remove counts in its direction

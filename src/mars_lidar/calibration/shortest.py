@@ -59,10 +59,10 @@ class Shortest:
     def decides(self, error: float) -> bool:
         """Whether this law determines the dead time better than counts that give it a standard `error`, ns.
 
-        Their 95 % interval is over twice as wide as this one, or narrower than all short intervals allow.
+        Their 95 % interval is over twice as wide as this one, or less than half as wide as all short intervals allow.
         """
         _, low, high = self.dead_time()
-        return 3.92 * error > 2.0 * (high - low) or 3.92 * error < self.narrowest()
+        return 3.92 * error > 2.0 * (high - low) or 3.92 * error < 0.5 * self.narrowest()
 
     def narrowest(self, cells: int = 12) -> float:
         """Width of the 95 % interval of the dead time given all intervals that jitter brings near its end.

@@ -533,8 +533,7 @@ def _changes(drift: Drift) -> list[Suspect]:
     for k in np.flatnonzero(drift.drifts):
         change = drift.change[k] / (drift.values[:, k].mean() if k == 0 else 1.0)
         words = "drift of the light, relative" if k == 0 else f"drift of {drift.names[k]}, ns"
-        error = abs(drift.change[k] / drift.trend[k]) * abs(change / drift.change[k])
-        out.append(Suspect(words, abs(drift.trend[k]), change, error, option=option))
+        out.append(Suspect(words, abs(drift.trend[k]), change, abs(change / drift.trend[k]), option=option))
     if drift.flickers:
         out.append(Suspect("flicker of the light, counts relative", drift.flicker_z, drift.flicker, option=option))
     return out

@@ -377,9 +377,12 @@ class Fit:
 
         A guess that is already the result of `finish` has the covariance with which the last streams are drawn.
 
+        An estimate far from the guess is made once more from where it is (`again`); the difference of both is then part
+        of the errors.
+
         The dead time follows from the shortest interval alone (`known`) if that contradicts the 95 % interval of the
-        counts, or is more precise, or if counts claim more than intervals can tell. The other parameters are then
-        fitted once more at that dead time.
+        counts, or is more precise, or if counts claim over twice as much as intervals can tell. The other parameters
+        are then fitted once more at that dead time.
         """
         model, centre, root, free, law = guess
         photons, effort = float(self.recording.photons), self.effort
@@ -424,7 +427,9 @@ class Fit:
         # cells and weights were made at other parameters: what new ones change is an error of laws that are not linear
         if again and effort.more > 1 and moved.max() > _NEAR:
             second = self.finish(Guess(model, near.centre, root_of(cov), free), known, again=False)
-            change = (second.theta - mean)[second.free] * (not model.effects)  # which start far from their values
+            if model.effects:  # which start far from their values
+                return second
+            change = (second.theta - mean)[second.free]
             return replace(second, covariance=second.covariance + np.outer(change, change))
         jacobian = law.slope[:, free] @ local
         # a parameter at a bound cannot move further, so that the projection does not remove counts in its direction

@@ -169,14 +169,12 @@ def calibrate_cube(
 
     hold, sigma = estimated(some, given_dead)
     # the likelihood takes light and armed passes as even within a bin: what that does to a simulated cube is an error
-    near = trial(hold.value, sigma.value)
-    light = MaximumLikelihood().estimate(Histograms(some, near, 1))
-    drawn = np.ascontiguousarray(simulate(_flux(light, near), near)[0, 0], some.dtype)
-    again = estimated(drawn, hold.value)
-    off = [each.value - own.value for each, own in zip(again, (hold, sigma), strict=True)]
-    hold, sigma = (_widened(own, abs(x)) for own, x in zip((hold, sigma), off, strict=True))
-    estimates = {"dead_time_ns": hold, "pulse_sigma_ns": sigma}
     final, response_error = trial(hold.value, sigma.value), None
+    light = MaximumLikelihood().estimate(Histograms(some, final, 1))
+    drawn = np.ascontiguousarray(simulate(_flux(light, final), final)[0, 0], some.dtype)
+    again = estimated(drawn, hold.value)
+    off = [abs(each.value - own.value) for each, own in zip(again, (hold, sigma), strict=True)]
+    estimates = {"dead_time_ns": _widened(hold, off[0]), "pulse_sigma_ns": _widened(sigma, off[1])}
     if pulse == "free":
 
         def with_response(dead: float) -> tuple[System, FloatArray]:
@@ -185,9 +183,9 @@ def calibrate_cube(
         # a dead time just below a period looks like the tail of a pulse, so that each is tried with its own response
         edges = np.unique(np.clip(hold.value + system.period_ns * np.linspace(-1.05, 1.05, 22), 0.0, most))
         deads, share = _law(lambda dead: _log_likelihood(some, with_response(dead)[0]), edges[:-1], edges[1:])
-        estimates = {"dead_time_ns": _widened(_estimate(deads, share, share >= 0.0), abs(off[0]))}
+        estimates = {"dead_time_ns": _widened(_estimate(deads, share, share >= 0.0), off[0])}
         final, response_error = with_response(estimates["dead_time_ns"].value)
-    light = MaximumLikelihood().estimate(Histograms(some, final, 1))
+        light = MaximumLikelihood().estimate(Histograms(some, final, 1))
     p_values = np.asarray(light.p_value)
     known = p_values[np.isfinite(p_values)]
     estimates["background_floor"] = _of_pixel(light, "background", int(np.argmin(light.background)))

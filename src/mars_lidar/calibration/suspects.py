@@ -149,8 +149,11 @@ class Trial:
         near = np.diag(guess.root).copy()
         near[np.isin(guess.free, fitted.free)] = np.sqrt(np.diag(fitted.covariance))
         near[guess.free == fitted.model.size] = self.score.error
-        final = self.fit.finish(guess._replace(root=np.diag(near)))
-        return final if final.converged and final.p_value > FALSE_ALARM else None
+        with suppress(ValueError, np.linalg.LinAlgError):
+            final = self.fit.finish(guess._replace(root=np.diag(near)))
+            if final.converged and final.p_value > FALSE_ALARM:
+                return final
+        return None
 
     @cached_property
     def final(self) -> Fitted | None:
@@ -158,13 +161,13 @@ class Trial:
         if self.direct is not None:
             return self.direct
         fit, guess, photons = self.fit.shorter, self.guess, float(self.fit.recording.photons)
-        try:
+        with suppress(ValueError, np.linalg.LinAlgError):
             if self.fitted.model.light + 2 in guess.free:  # the dead time has absorbed part of the effect
                 guess = guess._replace(theta=with_edge(fit, self.model, guess.theta))
             final = fit.finish(fit.steps(guess, photons, photons / 6.0)[0])
-        except (ValueError, np.linalg.LinAlgError):
-            return None
-        return final if final.converged else None
+            if final.converged:
+                return final
+        return None
 
     @property
     def refuted(self) -> bool:
@@ -215,8 +218,11 @@ def refitted(scores: Scores, trials: list[Trial]) -> tuple[Fitted, list[tuple[Sc
             refits.append((trial, final, scores.of(trial.effect, final.theta)))
     limit = scores.limit([*(trial.score for trial in trials), *(own for *_, own in refits if own.noise < 1.0)])
 
+    def larger(trial: Trial, score: Score) -> Score:
+        return max(trial.score, score, key=lambda each: each.z)
+
     def significant(trial: Trial, final: Fitted, score: Score) -> bool:
-        clear = max(trial.score.z, score.z) > limit and final.model.waveform is None
+        clear = larger(trial, score).z > limit and final.model.waveform is None
         return clear or fitted.p_value < FALSE_ALARM < final.p_value
 
     chosen = min((each for each in refits if significant(*each)), key=lambda each: each[1].misfit_z, default=None)
@@ -231,7 +237,7 @@ def refitted(scores: Scores, trials: list[Trial]) -> tuple[Fitted, list[tuple[Sc
         small = np.r_[fitted.model.bounded(other.theta), trial.effect.start]
         place = small if trial.score.z > score.z else final.theta
         again = Scores(fit, other).of(trial.effect, place)
-        if not 0.5 * (max(trial.score.z, score.z) + again.z) > limit:
+        if not 0.5 * (larger(trial, score).z + again.z) > limit:
             return (other, []) if fitted.p_value < FALSE_ALARM else None
     if trial.direct is None:
         last = fit.finish(Guess(final.model, final.theta, root_of(final.covariance), final.free), finished=True)
@@ -239,7 +245,7 @@ def refitted(scores: Scores, trials: list[Trial]) -> tuple[Fitted, list[tuple[Sc
             final, score = last, scores.of(trial.effect, last.theta)
     if not (better(final) and significant(trial, final, score)):
         return None
-    return final, [(max(trial.score, score, key=lambda each: each.z), fitted.misfit_z - final.misfit_z)]
+    return final, [(larger(trial, score), fitted.misfit_z - final.misfit_z)]
 
 
 @dataclass(frozen=True, eq=False)

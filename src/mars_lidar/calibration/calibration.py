@@ -466,12 +466,16 @@ class _Run:
         for _, theta in start.starts(fit, model, self.fixed)[:2]:
             trial = Guess(model, theta, np.diag(0.5 * model.scale(theta)[free]), free)
             tried.append(fit.steps(trial, min(photons, first)))
-        guess, _, settled = min(tried, key=lambda trial: trial[1])
+        early, _, settled = min(tried, key=lambda trial: trial[1])
+        guess, error = early, np.linalg.norm(early.root, axis=1)
         if first < photons:
             more = 6.0 if settled else 1.0
-            guess, _, settled = fit.steps(guess._replace(root=guess.root / more**0.5), photons, more * first)
+            guess, _, settled = fit.steps(early._replace(root=early.root / more**0.5), photons, more * first)
         final = fit.finish(guess)
-        return replace(final, converged=final.converged and (settled or final.p_value >= self.described.level))
+        # steps that did not settle may have led away from what the first photons say
+        near = bool((np.abs(final.theta - early.theta)[free] < 5.0 * error).all())
+        accepted = settled or (near and final.p_value >= self.described.level)
+        return replace(final, converged=final.converged and accepted)
 
     def assembled(
         self,

@@ -153,7 +153,7 @@ def counted(model: Model, cells: Cells, rows: FloatArray, cycles: int, seed: int
         streams = model.streams(rows[k : k + LIGHTS], cycles, seed + k)
         counts = cells.count(streams, pieces, cycles * model.clock.period_ns / pieces)
         totals.append(counts.sum(1))
-        off = (counts - counts.mean(1, keepdims=True)).reshape(-1, cells.size)
+        off = (counts - counts.mean(1, keepdims=True)).reshape(-1, cells.size).astype(np.float32)
         square += off.T @ off
     sd = np.sqrt(np.maximum(np.diag(square), 1e-300))
     return np.concatenate(totals), square / np.outer(sd, sd)
@@ -377,8 +377,9 @@ class Fit:
 
         A guess that is already the result of `finish` has the covariance with which the last streams are drawn.
 
-        An estimate far from the guess is made once more from where it is (`again`); the difference of both is then part
-        of the errors.
+        The estimate is made once more from where it is (`again`). The result is the mean of both, or the second one if
+        the first is far from the guess; the difference from the first is part of the errors. With an effect, whose
+        guess may be far away, only an estimate far from it is made again, and the second one is used.
 
         The dead time follows from the shortest interval alone (`known`) if that contradicts the 95 % interval of the
         counts, or is more precise, or if counts claim over twice as much as intervals can tell. The other parameters
@@ -424,13 +425,18 @@ class Fit:
             raw, cov = _curved(model, free, raw, cov, near, gain, recorded)
             mean = most_probable(model, raw, cov, free)
         moved = np.abs((near.centre - guess.theta)[free]) / np.sqrt(np.diag(cov))
-        # cells and weights were made at other parameters: what new ones change is an error of laws that are not linear
-        if again and effort.more > 1 and moved.max() > _NEAR:
+        # what new cells, weights and streams change is an error, of simulations and of laws that are not linear
+        far = bool(moved.max() > _NEAR)
+        if again and effort.more > 1 and (far or not model.effects):
             second = self.finish(Guess(model, near.centre, root_of(cov), free), known, again=False)
             if model.effects:  # which start far from their values
                 return second
-            change = (second.theta - mean)[second.free]
-            return replace(second, covariance=second.covariance + np.outer(change, change))
+            change = np.where(np.isin(np.arange(model.size), second.free), second.theta - mean, 0.0)
+            share = 1.0 if far else 0.5  # of the change in the error: of the second estimate, or of the mean of both
+            theta, raw = second.theta - (1.0 - share) * change, second.unbounded - (1.0 - share) * change
+            error = share * change[second.free]
+            covariance = second.covariance + np.outer(error, error)
+            return replace(second, theta=model.bounded(theta), unbounded=raw, covariance=covariance)
         jacobian = law.slope[:, free] @ local
         # a parameter at a bound cannot move further, so that the projection does not remove counts in its direction
         at_bound = ((model.bounded(mean + 1e-6 * (raw - mean)) == mean) & (raw != mean))[free]

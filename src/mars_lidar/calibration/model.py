@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -77,20 +76,6 @@ def effects(dead: float) -> tuple[Effect, ...]:
         Effect(("electronics_excess",), (EXCESS,), (0.0,), (19.0,), own),
         Effect(("paralyzable",), (1.0,), (0.0,), (1.0,), "paralyzable detector", onoff=True),
     )
-
-
-@cache
-def _quantiles() -> NDArray[np.float32]:
-    """Quantiles (65536,) of a normal law of variance 1/2, in the middle of equally probable parts."""
-    from scipy.special import ndtri
-
-    return np.asarray(0.5**0.5 * ndtri((np.arange(2**16) + 0.5) / 2**16), np.float32)
-
-
-def _normal_deviates(number: int, seed: int) -> NDArray[np.float32]:
-    """Normal deviates (n,), each the sum of two quantiles of 16 random bits: two thirds of the time of NumPy's."""
-    first, second = np.random.Generator(np.random.SFC64(seed)).integers(0, 2**16, (2, number), np.uint16)
-    return np.asarray(_quantiles()[first] + _quantiles()[second])
 
 
 class Waveform:
@@ -277,7 +262,6 @@ class Model:
         made = ExactEngine().records(task, float(cycles * np.minimum(flux.total, most).sum()))
         sigma = self.widths(rows)[1] * jitter
         sigma[sigma <= _NARROWEST * self.clock.period_ns] = 0.0
-        deviates = _normal_deviates(made.phase.size if sigma.any() else 0, seed)
         times, drawn = np.empty(made.phase.size), (made.cycle, made.phase, made.offsets)
-        _core.recorded_times(*drawn, sigma_ns=sigma, deviates=deviates, grid=self.clock, out=times)
+        _core.recorded_times(*drawn, sigma_ns=sigma, seed=seed, grid=self.clock, out=times)
         return Recording(tuple(np.split(times, made.offsets[1:-1])), (float(cycles),) * len(rows), self.clock)

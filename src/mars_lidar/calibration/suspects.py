@@ -15,6 +15,8 @@ from mars_lidar.calibration.model import Effect, Model, effects
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording
 from mars_lidar.calibration.start import with_edge
 
+_SIGNIFICANT = 3.44  # standard deviations that the largest of seven independent scores exceeds in 0.2 % of streams
+
 
 class Score(NamedTuple):
     """Size of an effect from the residual counts, its standard deviation, and the shift of the parameters.
@@ -41,7 +43,7 @@ class Scores:
 
     def __init__(self, fit: Fit, fitted: Fitted) -> None:
         self.fit, self.fitted = fit, fitted
-        self._plain: dict[float, FloatArray] = {}
+        self._plain: dict[float, tuple[FloatArray, float]] = {}
 
     def counts(self, model: Model, theta: FloatArray, times: float = 1.0) -> tuple[FloatArray, float]:
         """Counts that a model expects in the cells of the fit, by `times` a batch; ratio of their variance to them."""
@@ -56,25 +58,27 @@ class Scores:
 
         From that change the part is removed that the other parameters of the fit can absorb. The noise of the
         simulated counts makes the size too small on average, and no false score; where much of the change is noise, a
-        score above 1 is estimated again by longer streams, of `times` a batch.
+        score above 1 is estimated again by longer streams, of `times` a batch, if that may decide its significance.
         """
         fitted, used, effort = self.fitted, self.fitted.batch.common, self.fit.effort
         wider = replace(fitted.model, effects=(*fitted.model.effects, effect))
         size, weight = max(float(theta[fitted.model.size]), 1e-9), fitted.batch.weight[np.ix_(used, used)]
-        if times not in self._plain:
-            self._plain[times] = self.counts(fitted.model, fitted.theta, times)[0]
-        plain, (made, share) = self._plain[times], self.counts(wider, theta, times)
-        change, noise = (made - plain) / size, (plain + made) * share / size**2
+        enough = min((each for each in self._plain if each >= times), default=times)
+        if enough not in self._plain:
+            self._plain[times] = self.counts(fitted.model, fitted.theta, times)
+        (plain, own), (made, share) = self._plain[enough], self.counts(wider, theta, times)
+        change, noise = (made - plain) / size, (plain * own + made * share) / size**2
         shift = fitted.estimator @ change
         way = change - fitted.jacobian @ shift
         along = np.zeros_like(way)
         along[used] = weight @ way[used]
         square = max(float(way @ along), 1e-300)
         along /= square
-        spread = float((fitted.fresh @ along).std()) * (1.0 + 2.0 * share) ** 0.5
+        spread = float((fitted.fresh @ along).std()) * (1.0 + own + share) ** 0.5
         part = float(noise[used] @ np.diag(weight)) / square
         score = Score(effect, float(fitted.rest @ along), spread, along, part, shift)
-        if score.z < 1.0 or part < effort.noise or times > 1.0:
+        off, grown = 2.0 * part**0.5, score.z * max(1.0 - part, 0.01) ** -0.5
+        if score.z < 1.0 or part < effort.noise or times > 1.0 or not score.z - off < _SIGNIFICANT < grown + off:
             return score
         return self.of(effect, theta, min(effort.closest, np.ceil(part / effort.noise)))
 
@@ -232,7 +236,7 @@ def refitted(scores: Scores, trials: list[Trial]) -> tuple[Fitted, list[tuple[Sc
     # the fit without the effect once more, from the place of the refit: the first one may have been bad
     known = final.free < size
     root = root_of(final.covariance[np.ix_(known, known)])
-    other = fit.finish(Guess(fitted.model, final.theta[:size], root, final.free[known]))
+    other = fit.finish(Guess(fitted.model, final.theta[:size], root, final.free[known]), again=False)
     if other.converged and other.p_value > 0.05:
         small = np.r_[fitted.model.bounded(other.theta), trial.effect.start]
         place = small if trial.score.z > score.z else final.theta

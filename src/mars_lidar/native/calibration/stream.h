@@ -5,6 +5,9 @@
 #include <utility>
 #include <vector>
 
+#include "numbers/elementary.h"
+#include "numbers/word_stream.h"
+
 namespace mars {
 
 // The whole number below x, by a conversion: the baseline's std::floor is a call.
@@ -27,6 +30,32 @@ struct RecorderClock {
         const double steps = whole_below((t - start) * (1.0 / unit) + (0.5 - offset));
         return (steps + offset) * unit + start;
     }
+};
+
+// Normal deviates of one stream, each the sum of two quantiles, of 16 random bits, of a normal law of variance 1/2.
+class NormalDeviates {
+ public:
+    NormalDeviates(uint64_t seed, uint32_t stream)
+        : quantiles_(quantiles()), words_(word_stream(stream_key(seed ^ 0x6a69747465720000u, 0, stream))) {}
+
+    double operator()() {
+        const uint32_t word = words_.next();
+        return static_cast<double>(quantiles_[word & 0xffffu] + quantiles_[word >> 16]);
+    }
+
+ private:
+    static const float* quantiles() {
+        static const std::vector<float> of = [] {
+            std::vector<float> out(1 << 16);
+            for (size_t k = 0; k < out.size(); ++k)
+                out[k] = static_cast<float>(std::sqrt(0.5) * normal_quantile((static_cast<double>(k) + 0.5) * 0x1p-16));
+            return out;
+        }();
+        return of.data();
+    }
+
+    const float* quantiles_;
+    WordStream<uint32_t> words_;
 };
 
 // Sorts times of which jitter has exchanged few.
@@ -59,10 +88,10 @@ class StreamCounter {
     explicit StreamCounter(const StreamCells& cells) : cells_(cells), first_(kParts + 1) {
         const double top = cells.gap_edges.empty() ? 1.0 : cells.gap_edges.back();
         scale_ = kParts / top;
-        for (int64_t k = 0; k <= kParts; ++k) {
+        for (int64_t k = 0, edge = 0; k <= kParts; ++k) {
             const double begin = static_cast<double>(k) / scale_ * (1.0 - 1e-9);
-            first_[k] =
-                std::lower_bound(cells.gap_edges.begin(), cells.gap_edges.end(), begin) - cells.gap_edges.begin();
+            while (edge + 1 < cells.gaps() && cells.gap_edges[edge] < begin) ++edge;
+            first_[k] = edge;
         }
     }
 

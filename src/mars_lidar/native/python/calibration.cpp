@@ -24,11 +24,10 @@ void check_offsets(const Vector<const int64_t>& offsets, int64_t times) {
 
 void recorded_times(const Vector<const int32_t>& cycle, const Vector<const float>& phase,
                     const Vector<const int64_t>& offsets, const Vector<const double>& sigma,
-                    const Vector<const float>& deviates, const std::tuple<double, double, double, bool>& grid,
-                    const Vector<double>& out) {
+                    uint64_t seed, const std::tuple<double, double, double, bool>& grid, const Vector<double>& out) {
     const int64_t n = size_of(out);
-    if (size_of(cycle) != n || size_of(phase) != n || (size_of(deviates) != n && size_of(deviates) != 0))
-        throw nb::value_error("cycle, phase, deviates and out must be of one length; deviates may be empty");
+    if (size_of(cycle) != n || size_of(phase) != n)
+        throw nb::value_error("cycle, phase and out must be of one length");
     check_offsets(offsets, n);
     if (size_of(sigma) != size_of(offsets) - 1) throw nb::value_error("sigma must have a value for each stream");
     const auto [period, unit, offset, locked] = grid;
@@ -37,10 +36,11 @@ void recorded_times(const Vector<const int32_t>& cycle, const Vector<const float
     for (int64_t stream = 0; stream + 1 < size_of(offsets); ++stream) {
         const int64_t first = offsets.data()[stream], end = offsets.data()[stream + 1];
         double* const t = out.data();
-        const bool jittered = size_of(deviates) == n && sigma.data()[stream] > 0.0;
+        const double width = sigma.data()[stream];
+        NormalDeviates deviate(seed, static_cast<uint32_t>(stream));
         for (int64_t k = first; k < end; ++k) {
             t[k] = registration_time(cycle.data()[k], phase.data()[k]) * period;
-            if (jittered) t[k] += sigma.data()[stream] * static_cast<double>(deviates.data()[k]);
+            if (width > 0.0) t[k] += width * deviate();
         }
         sort_nearly_sorted(t + first, end - first);
         for (int64_t k = first; k < end; ++k) t[k] = clock(t[k]);
@@ -90,9 +90,9 @@ void bind_calibration(nb::module_& module) {
             "phases"_a, "classes"_a, "ages"_a)
         .def_prop_ro("size", &StreamCells::size);
     module.def(
-        "recorded_times", &recorded_times, "cycle"_a, "phase"_a, "offsets"_a, nb::kw_only(), "sigma_ns"_a, "deviates"_a,
+        "recorded_times", &recorded_times, "cycle"_a, "phase"_a, "offsets"_a, nb::kw_only(), "sigma_ns"_a, "seed"_a,
         "grid"_a, "out"_a.noconvert(),
-        "Times of streams with jitter, sorted, on the grid (period, unit, offset, locked) of a recorder: out (n).");
+        "Times of streams with normal jitter, sorted, on the grid (period, unit, offset, locked) of a recorder: out (n).");
     module.def("count_streams", &count_streams, "cells"_a, "times"_a, "offsets"_a, nb::kw_only(), "pieces"_a,
                "length"_a, "out"_a.noconvert(),
                "Counts of streams of sorted times in pieces of this length: out (streams * pieces, cells).");

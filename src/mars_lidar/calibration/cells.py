@@ -25,6 +25,8 @@ class Cells:
     def __init__(self, model: Model, theta: FloatArray, pilot: Recording, photons: float) -> None:
         period, unit = model.clock.period_ns, model.clock.unit_ns
         gaps, phases = pilot.intervals, pilot.times / period % 1.0
+        if not gaps.size:
+            raise ValueError("simulated streams of these parameters have no intervals")
         edges, lit = self._layout(model, theta, phases)
         centre = (np.arange(_PHASES) + 0.5) / _PHASES
         # phases from which the dead time, or a shorter one that electronics' dead time hides, ends in a pulse

@@ -23,11 +23,10 @@ void check_offsets(const Vector<const int64_t>& offsets, int64_t times) {
 }
 
 void recorded_times(const Vector<const int32_t>& cycle, const Vector<const float>& phase,
-                    const Vector<const int64_t>& offsets, const Vector<const double>& sigma,
-                    uint64_t seed, const std::tuple<double, double, double, bool>& grid, const Vector<double>& out) {
+                    const Vector<const int64_t>& offsets, const Vector<const double>& sigma, uint64_t seed,
+                    const std::tuple<double, double, double, bool>& grid, const Vector<double>& out) {
     const int64_t n = size_of(out);
-    if (size_of(cycle) != n || size_of(phase) != n)
-        throw nb::value_error("cycle, phase and out must be of one length");
+    if (size_of(cycle) != n || size_of(phase) != n) throw nb::value_error("cycle, phase and out must be of one length");
     check_offsets(offsets, n);
     if (size_of(sigma) != size_of(offsets) - 1) throw nb::value_error("sigma must have a value for each stream");
     const auto [period, unit, offset, locked] = grid;
@@ -89,10 +88,10 @@ void bind_calibration(nb::module_& module) {
             nb::kw_only(), "period_ns"_a, "shift"_a, "phase_of"_a, "class_of"_a, "lit_of"_a, "gap_edges"_a, "age_of"_a,
             "phases"_a, "classes"_a, "ages"_a)
         .def_prop_ro("size", &StreamCells::size);
-    module.def(
-        "recorded_times", &recorded_times, "cycle"_a, "phase"_a, "offsets"_a, nb::kw_only(), "sigma_ns"_a, "seed"_a,
-        "grid"_a, "out"_a.noconvert(),
-        "Times of streams with normal jitter, sorted, on the grid (period, unit, offset, locked) of a recorder: out (n).");
+    module.def("recorded_times", &recorded_times, "cycle"_a, "phase"_a, "offsets"_a, nb::kw_only(), "sigma_ns"_a,
+               "seed"_a, "grid"_a, "out"_a.noconvert(),
+               "Times of streams with normal jitter, sorted, on the grid (period, unit, offset, locked) of a recorder: "
+               "out (n).");
     module.def("count_streams", &count_streams, "cells"_a, "times"_a, "offsets"_a, nb::kw_only(), "pieces"_a,
                "length"_a, "out"_a.noconvert(),
                "Counts of streams of sorted times in pieces of this length: out (streams * pieces, cells).");

@@ -53,7 +53,7 @@ class ExactEngine(Engine):
         available = available_bytes()
         if available is not None and 2 * PhaseRecords.BYTES * room > available:
             room = int(self.counts(task).sum())
-            check_memory(room * PhaseRecords.BYTES, f"timestamps of shape ({room},)", IN_PARTS)
+        check_memory(room * PhaseRecords.BYTES, f"timestamps of shape ({room},)", IN_PARTS)
         offsets = np.empty(task.items + 1, np.int64)
         cycle, phase = np.empty(room, np.int32), np.empty(room, np.float32)
         drawn = _core.exact_records(

@@ -117,7 +117,10 @@ def test_streams_of_which_earlier_code_was_wrong(number: int) -> None:
 
 @pytest.mark.full
 def test_a_dead_time_that_two_early_intervals_refuse() -> None:
-    """Eleven intervals a nanosecond at its end, of which few were recorded: the counts say .9 ns more, 7.6 errors."""
+    """Eleven intervals a nanosecond at its end, of which few were recorded: the counts say .9 ns more, 7.6 errors.
+
+    The true dead time lies at the end of the 95 % interval, which with seed 3142 begins 0.002 ns behind it.
+    """
     truth, photons = random_truth(3142)
     result = ml.calibrate(stream(truth, photons, 3142), seed=1)
     assert result.fits
@@ -513,12 +516,12 @@ def test_native_counts_are_those_of_numpy() -> None:
     from mars_lidar.calibration.recording import Clock
 
     rows = np.array([[0.15, 0.4, 30.0, 0.316, angle, 50.0] for angle in (0.0, 0.3, 0.8)])
-    for clock in (Clock(100.0, 1e-3, 0.5), Clock(100.3, 0.064, 0.5), Clock(100.3, 0.25, 0.5, locked=True)):
+    for clock in (Clock(100.0), Clock(100.3, 0.064, 0.5, locked=False), Clock(100.3, 0.25, 0.5, locked=True)):
         model = Model(clock, 1)
         streams = model.streams(rows, 4000, 3)
         for t in streams:
             assert (np.diff(t) >= 0.0).all()
-            if not clock.locked:
+            if clock.unit_ns and not clock.locked:
                 assert np.abs(t / clock.unit_ns % 1.0 - 0.5).max() < 1e-6
         cells = Cells(model, rows[0], streams, 1e4)
         gaps = slice(cells.phases, cells.phases + cells.gap_edges.size + 1)

@@ -405,6 +405,8 @@ class _Run:
         if fitted.converged and not wrong and not (drift and drift.flickers):  # which looks like effects
             fitted, included, trials = suspects.search(fit, fitted)
             drift = suspects.drift(fit, fitted) if included else drift
+        if fitted.converged and not included:
+            fitted = fit.repeated(fitted)
         if attempt == 0 and not included and not wrong and fitted.p_value < FALSE_ALARM:
             other = self.result(Effort.attempts)
             if other.fits:

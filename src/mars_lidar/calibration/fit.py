@@ -377,9 +377,8 @@ class Fit:
 
         A guess that is already the result of `finish` has the covariance with which the last streams are drawn.
 
-        The estimate is made once more from where it is (`again`). The result is the mean of both, or the second one if
-        the first is far from the guess; the difference from the first is part of the errors. With an effect, whose
-        guess may be far away, only an estimate far from it is made again, and the second one is used.
+        If the estimate is far from the guess, whose cells and weights it has, it is made again from where it is
+        (`again`).
 
         The dead time follows from the shortest interval alone (`known`) if that contradicts the 95 % interval of the
         counts, or is more precise, or if counts claim over twice as much as intervals can tell. The other parameters
@@ -425,18 +424,8 @@ class Fit:
             raw, cov = _curved(model, free, raw, cov, near, gain, recorded)
             mean = most_probable(model, raw, cov, free)
         moved = np.abs((near.centre - guess.theta)[free]) / np.sqrt(np.diag(cov))
-        # what new cells, weights and streams change is an error, of simulations and of laws that are not linear
-        far = bool(moved.max() > _NEAR)
-        if again and effort.more > 1 and (far or not model.effects):
-            second = self.finish(Guess(model, near.centre, root_of(cov), free), known, again=False)
-            if model.effects:  # which start far from their values
-                return second
-            change = np.where(np.isin(np.arange(model.size), second.free), second.theta - mean, 0.0)
-            share = 1.0 if far else 0.5  # of the change in the error: of the second estimate, or of the mean of both
-            theta, raw = second.theta - (1.0 - share) * change, second.unbounded - (1.0 - share) * change
-            error = share * change[second.free]
-            covariance = second.covariance + np.outer(error, error)
-            return replace(second, theta=model.bounded(theta), unbounded=raw, covariance=covariance)
+        if again and effort.more > 1 and moved.max() > _NEAR:
+            return self.finish(Guess(model, near.centre, root_of(cov), free), known, again=False)
         jacobian = law.slope[:, free] @ local
         # a parameter at a bound cannot move further, so that the projection does not remove counts in its direction
         at_bound = ((model.bounded(mean + 1e-6 * (raw - mean)) == mean) & (raw != mean))[free]
@@ -467,6 +456,27 @@ class Fit:
                 p = min(p, early)
         counts = estimator, jacobian, rest, departure, fresh
         return Fitted(model, free, mean, cov, raw, law, near.offset, *counts, z, p, bool(size.max() < _NEAR), interval)
+
+    def repeated(self, fitted: Fitted) -> Fitted:
+        """The mean of a fit and of one more from its place, with other cells, weights and simulated streams.
+
+        They differ by the noise of simulated streams, and where counts are not linear in the parameters. The covariance
+        is the mean of both, since each has such noise too, and no error is smaller than the difference.
+        """
+        guess = Guess(fitted.model, fitted.theta, root_of(fitted.covariance), fitted.free)
+        other = self.finish(guess, known=fitted.by_shortest is not None, again=False)
+        free, change = other.free, np.zeros_like(other.theta)
+        change[free] = (other.theta - fitted.theta)[free]
+        same = np.isin(fitted.free, free)  # all but a dead time that has just been taken from the shortest interval
+        covariance = 0.5 * (fitted.covariance[np.ix_(same, same)] + other.covariance)
+        growth = np.maximum(1.0, np.abs(change[free]) / np.sqrt(np.diag(covariance)))
+        return replace(
+            other,
+            theta=other.model.bounded(other.theta - 0.5 * change),
+            unbounded=other.unbounded - 0.5 * change,
+            covariance=covariance * np.outer(growth, growth),
+            converged=fitted.converged and other.converged,
+        )
 
 
 def _curved(

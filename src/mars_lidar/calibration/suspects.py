@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,8 @@ from mars_lidar.calibration.model import Effect, Model, effects
 from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording
 from mars_lidar.calibration.start import with_edge
 
-_SIGNIFICANT = 3.44  # standard deviations that the largest of seven independent scores exceeds in 0.2 % of streams
+# standard deviations that the largest of seven independent scores exceeds with the probability of a false alarm
+_SIGNIFICANT = NormalDist().inv_cdf((1.0 - FALSE_ALARM) ** (1.0 / 7.0))
 
 
 class Score(NamedTuple):

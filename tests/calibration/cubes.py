@@ -84,7 +84,7 @@ def random_cube(number: int) -> Cube:
 
 def pull(estimate: Estimate, true: float) -> float:
     """(estimate - truth) / stated error."""
-    return (estimate.value - true) / estimate.error
+    return float((estimate.value - true) / estimate.error)
 
 
 def main() -> None:

@@ -218,40 +218,41 @@ def refitted(scores: Scores, trials: list[Trial]) -> tuple[Fitted, list[tuple[Sc
         return bool(final.theta[size] > 0.0 and final.p_value > min(FALSE_ALARM, fitted.p_value))
 
     refits: list[tuple[Trial, Fitted, Score]] = []
+    tested = [trial.score for trial in trials]
     for trial in [trial for trial in trials if trial.direct is not None] or trials:
         final = trial.final
         if final is not None and better(final):
-            refits.append((trial, final, scores.of(trial.effect, final.theta)))
-    limit = scores.limit([*(trial.score for trial in trials), *(own for *_, own in refits if own.noise < 1.0)])
+            own = scores.of(trial.effect, final.theta) if trial.direct is None else trial.score
+            refits.append((trial, final, max(trial.score, own, key=lambda score: score.z)))
+            tested += [own] if own.noise < 1.0 else []
+    limit = scores.limit(tested)
 
-    def larger(trial: Trial, score: Score) -> Score:
-        return max(trial.score, score, key=lambda each: each.z)
-
-    def significant(trial: Trial, final: Fitted, score: Score) -> bool:
-        clear = larger(trial, score).z > limit and final.model.waveform is None
+    def significant(final: Fitted, score: Score) -> bool:
+        clear = score.z > limit and final.model.waveform is None
         return clear or fitted.p_value < FALSE_ALARM < final.p_value
 
-    chosen = min((each for each in refits if significant(*each)), key=lambda each: each[1].misfit_z, default=None)
+    chosen = min((each for each in refits if significant(*each[1:])), key=lambda each: each[1].misfit_z, default=None)
     if chosen is None:
         return None
     trial, final, score = chosen
     # the fit without the effect once more, from the place of the refit: the first one may have been bad
-    known = final.free < size
-    root = root_of(final.covariance[np.ix_(known, known)])
-    other = fit.finish(Guess(fitted.model, final.theta[:size], root, final.free[known]), again=False)
-    if other.converged and other.p_value > 0.05:
-        small = np.r_[fitted.model.bounded(other.theta), trial.effect.start]
-        place = small if trial.score.z > score.z else final.theta
-        again = Scores(fit, other).of(trial.effect, place)
-        if not 0.5 * (larger(trial, score).z + again.z) > limit:
-            return (other, []) if fitted.p_value < FALSE_ALARM else None
+    if 0.5 * score.z < limit:
+        known = final.free < size
+        root = root_of(final.covariance[np.ix_(known, known)])
+        other = fit.finish(Guess(fitted.model, final.theta[:size], root, final.free[known]), again=False)
+        if other.converged and other.p_value > 0.05:
+            small = np.r_[fitted.model.bounded(other.theta), trial.effect.start]
+            again = Scores(fit, other).of(trial.effect, small if score is trial.score else final.theta)
+            if not 0.5 * (score.z + again.z) > limit:
+                return (other, []) if fitted.p_value < FALSE_ALARM else None
     if trial.direct is None:
         last = fit.finish(Guess(final.model, final.theta, root_of(final.covariance), final.free), finished=True)
         if last.converged:
-            final, score = last, scores.of(trial.effect, last.theta)
-    if not (better(final) and significant(trial, final, score)):
+            own = scores.of(trial.effect, last.theta)
+            final, score = last, max(trial.score, own, key=lambda score: score.z)
+    if not (better(final) and significant(final, score)):
         return None
-    return final, [(larger(trial, score), fitted.misfit_z - final.misfit_z)]
+    return final, [(score, fitted.misfit_z - final.misfit_z)]
 
 
 @dataclass(frozen=True, eq=False)

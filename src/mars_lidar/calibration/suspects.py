@@ -343,8 +343,10 @@ def drift(fit: Fit, fitted: Fitted) -> Drift | None:
     steps[1 + np.arange(delays.size), delays] = 0.5 * model.scale(fitted.theta)[delays]
     up, down = (np.array([scores.counts(model, fitted.theta + step)[0] for step in way * steps]) for way in (1, -1))
     response = (0.5 * (up - down) / steps.sum(1)[:, None]).T
+    # a single count in a cell where none is expected in a part would decide
+    weight = batch.weight * np.outer(*[fitted.offset > 2.0 * len(parts)] * 2)
     # and the number of registrations, because the weights are noisy
-    sums = np.vstack([response.T @ batch.weight, np.arange(len(response)) < batch.cells.phases])
+    sums = np.vstack([response.T @ weight, np.arange(len(response)) < batch.cells.phases])
     precision = np.linalg.pinv(np.cov(sums @ fitted.noise.T))
     known = (sums @ response).T @ precision
     estimator = np.linalg.pinv(known @ sums @ response) @ known @ sums

@@ -191,6 +191,20 @@ def test_a_dead_time_that_two_fits_estimate_differently() -> None:
 
 
 @pytest.mark.full
+def test_no_drift_of_a_bright_constant_pixel() -> None:
+    """S = 10: one count in a cell where a part expects none was a drift of the light and of the delay (p = 7e-187)."""
+    system = ml.System(
+        period_ns=1e3 / 7.5, cycles=98_252, bins=1024, pulse=ml.GaussianPulse(sigma_ns=0.5),
+        detector=ml.Detector(dead_time_ns=85.0),
+    )  # fmt: skip
+    times = ml.simulate_timestamps(ml.Flux(10.0, 0.1, 40.0), system, seed=2052)
+    result = ml.calibrate(times, seed=1)
+    assert result.drift is not None
+    assert result.drift.probability > 0.002
+    assert not result.suspects
+
+
+@pytest.mark.full
 @pytest.mark.parametrize("seed", [2, 5, *nightly(6, 8)])
 def test_a_delay_at_an_end_of_the_period(seed: int) -> None:
     """Delay, interval and ranges are of one period: -0.07 to 100.06 ns was once a range, for 0 of 100."""

@@ -65,7 +65,8 @@ class Fault:
 
 def _detector(**effects: Any) -> Detector:
     """The detector of the streams; of millions of photons without any jitter the calibration may reject the model."""
-    return Detector(**{"dead_time_ns": DEAD_NS, "jitter": Jitter(sigma_ns=JITTER_NS)} | effects)
+    fields: dict[str, Any] = {"jitter": Jitter(sigma_ns=JITTER_NS)} | effects
+    return Detector(dead_time_ns=DEAD_NS, **fields)
 
 
 FAULTS = (

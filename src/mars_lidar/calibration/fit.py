@@ -23,6 +23,7 @@ from mars_lidar.calibration.shortest import Shortest, shortest_law
 Index: TypeAlias = NDArray[np.intp]
 LIGHTS = 16  # streams of one detector, in one call of the engine
 _NEAR = 3.0  # standard errors of the recording about the estimate, from which the last streams are drawn
+_FAR = 5.0  # standard errors of a dead time above that by the shortest interval, from which on it is fitted there, too
 _CUMULATED = 100.0  # intervals expected up to an edge, for a normal law of their number
 
 
@@ -381,8 +382,9 @@ class Fit:
         (`again`).
 
         The dead time follows from the shortest interval alone (`known`) if that contradicts the 95 % interval of the
-        counts, or is more precise, or if counts claim over twice as much as intervals can tell. The other parameters
-        are then fitted once more at that dead time.
+        counts, or is more precise, or if counts claim over twice as much as intervals can tell; or where a fit at that
+        dead time, far below that of the counts, does not return to theirs. The other parameters are then fitted once
+        more at that dead time.
         """
         model, centre, root, free, law = guess
         photons, effort = float(self.recording.photons), self.effort
@@ -440,7 +442,9 @@ class Fit:
         if not (model.effects or model.fields):
             early, shortest = self.shortest(model, draws(model, raw, cov, free))
             dead, timed = shortest.dead_time(), free == model.light + 2
-            if timed.any() and (early < 0.05 or shortest.decides(np.sqrt(np.diag(cov)[timed][0]))):
+            error = float(np.sqrt(cov[timed, timed].sum()))
+            surely = early < 0.05 or shortest.decides(error)
+            if timed.any() and (surely or mean[model.light + 2] - dead[0] > _FAR * error):
                 at = mean.copy()
                 at[model.light + 2] = dead[0]
                 own = Guess(model, at, root_of(cov[np.ix_(~timed, ~timed)]), free[~timed])
@@ -449,13 +453,25 @@ class Fit:
                     if not (other.converged and other.p_value > FALSE_ALARM):
                         break
                 else:
-                    return other
+                    if surely or self._stays(other, mean, error, free):
+                        return other
             if known:
                 interval, mean[model.light + 2] = dead, dead[0]
             elif early < FALSE_ALARM:
                 p = min(p, early)
         counts = estimator, jacobian, rest, departure, fresh
         return Fitted(model, free, mean, cov, raw, law, near.offset, *counts, z, p, bool(size.max() < _NEAR), interval)
+
+    def _stays(self, fitted: Fitted, before: FloatArray, error: float, free: Index) -> bool:
+        """Whether steps of all free parameters from this fit do not return to the dead time `before`.
+
+        Then no count determines it: it ends where hardly any light is.
+        """
+        place, root = fitted.model.light + 2, np.diag(np.full(len(free), error))
+        known = np.isin(free, fitted.free)
+        root[np.ix_(known, known)] = root_of(fitted.covariance)
+        after = self.steps(Guess(fitted.model, fitted.theta, root, free), float(self.recording.photons), np.inf)[0]
+        return bool(after.theta[place] < 0.5 * (fitted.theta[place] + before[place]))
 
     def repeated(self, fitted: Fitted) -> Fitted:
         """The mean of a fit and of one more from its place, with other cells, weights and simulated streams.

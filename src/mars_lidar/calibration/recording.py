@@ -140,7 +140,8 @@ def clock_of(t: FloatArray, stream: Timestamps, probed: int = 2000) -> Clock:
     period = stream.period_ns
     probe = t[:: max(1, t.size // probed)]
     given = float(stream.info.get("unit_ns", 0.0))
-    own = [period / (most // stream.bins * stream.bins) for most in (2**15, 2**16)]  # our PTU and Photon-HDF5
+    # our PTU and Photon-HDF5
+    own = [period / (most // stream.bins * stream.bins) for most in (2**15, 2**16) if stream.bins <= most]
     for unit in [given] if given > 0.0 else own:
         for locked, place in ((False, probe / unit), (True, probe / period % 1.0 * period / unit)):
             first = locked & (place < 1.0)  # those of the last unit of a period may lie beyond its end

@@ -191,6 +191,15 @@ def test_a_dead_time_that_two_fits_estimate_differently() -> None:
 
 
 @pytest.mark.full
+@pytest.mark.parametrize("seed", [1, *nightly(2)])
+def test_a_dead_time_that_ends_in_the_dark(seed: int) -> None:
+    """Without background it may end anywhere between two pulses: 98.91 ± 0.35 ns was stated for 50."""
+    truth = replace(BASE, background=0.0)
+    dead = ml.calibrate(stream(truth, 20_000, seed), seed=seed - 1).estimates["dead_time_ns"]
+    assert dead.low <= truth.dead <= dead.high
+
+
+@pytest.mark.full
 def test_no_drift_of_a_bright_constant_pixel() -> None:
     """S = 10: one count in a cell where a part expects none was a drift of the light and of the delay (p = 7e-187)."""
     system = ml.System(
@@ -312,6 +321,12 @@ def test_the_clock_of_a_period_that_ends_within_a_unit() -> None:
     look = ml.calibrate(stream(truth, 5_000, 3234), look=True).look
     assert look.unit_ns == truth.unit
     assert look.locked
+
+
+def test_bins_finer_than_any_clock_of_ours() -> None:
+    """Of 100,000 bins in a period no clock is guessed from the bins (a division by zero once)."""
+    times = replace(stream(BASE, 1000, 1), bins=100_000, info={})
+    assert ml.calibrate(times, look=True).look.unit_ns == 0.0
 
 
 @pytest.mark.full

@@ -24,6 +24,9 @@ Index: TypeAlias = NDArray[np.intp]
 LIGHTS = 16  # streams of one detector, in one call of the engine
 _NEAR = 3.0  # standard errors of the recording about the estimate, from which the last streams are drawn
 _FAR = 5.0  # standard errors of a dead time above that by the shortest interval, from which on it is fitted there, too
+_DOUBTFUL = 0.01  # p-value below which a fit is tested again
+_STREAMS = 64  # by so many streams
+_RETESTED = 3.2e7  # of so many photons at most
 _CUMULATED = 100.0  # intervals expected up to an edge, for a normal law of their number
 
 
@@ -428,16 +431,19 @@ class Fit:
         moved = np.abs((near.centre - guess.theta)[free]) / np.sqrt(np.diag(cov))
         if again and effort.more > 1 and moved.max() > _NEAR:
             return self.finish(Guess(model, near.centre, root_of(cov), free), known, again=False)
-        jacobian = law.slope[:, free] @ local
+        jacobian, identity = law.slope[:, free] @ local, np.eye(len(recorded))
+        unbound = identity - jacobian @ estimator
         # a parameter at a bound cannot move further, so that the projection does not remove counts in its direction
         at_bound = ((model.bounded(mean + 1e-6 * (raw - mean)) == mean) & (raw != mean))[free]
         estimator = estimator - cov[:, at_bound] @ np.linalg.pinv(cov[np.ix_(at_bound, at_bound)]) @ estimator[at_bound]
-        project = np.eye(len(recorded)) - jacobian @ estimator
+        project = identity - jacobian @ estimator
         departure = near.residual * (len(near.residual) / freedom / near.ratio) ** 0.5
         fresh = departure @ project.T
         fresh -= fresh.mean(0)
         rest = project @ (recorded - near.offset - jacobian[:, at_bound] @ (mean - near.centre)[free[at_bound]])
-        z, p = _misfit(rest, fresh, law, near)
+        z, p = _misfit(rest, fresh, law, near.offset, near.ratio / len(near.counts))
+        if p < _DOUBTFUL and effort.more > 1:
+            p = self._tested_again(model, draws(model, raw, cov, free), law, near.offset, unbound)
         interval = None
         if not (model.effects or model.fields):
             early, shortest = self.shortest(model, draws(model, raw, cov, free))
@@ -461,6 +467,22 @@ class Fit:
                 p = min(p, early)
         counts = estimator, jacobian, rest, departure, fresh
         return Fitted(model, free, mean, cov, raw, law, near.offset, *counts, z, p, bool(size.max() < _NEAR), interval)
+
+    def _tested_again(
+        self, model: Model, rows: FloatArray, law: Batch, offset: FloatArray, project: FloatArray
+    ) -> float:
+        """The p-value of the misfit by streams about as long as the recording, of parameters (n, p) from their law.
+
+        Counts that are not linear in the parameters scatter more in these than in the shorter streams of a linear law.
+        """
+        photons = float(self.recording.photons)
+        cycles = max(2, round(self.exposure(min(photons, _RETESTED / _STREAMS))))
+        made = [law.cells.of(model.streams(row, cycles, self.next_seed())) for row in rows[:_STREAMS]]
+        rest = (np.array(made) * (self.exposure(photons) / cycles) - offset) @ project.T
+        mean = rest.mean(0)
+        return _misfit(
+            project @ (law.cells.of(self.recording) - offset) - mean, rest - mean, law, offset, 1 / len(rest)
+        )[1]
 
     def _stays(self, fitted: Fitted, before: FloatArray, error: float, free: Index) -> bool:
         """Whether steps of all free parameters from this fit do not return to the dead time `before`.
@@ -524,8 +546,10 @@ def _curved(
     return theta, np.cov(at.T, aweights=weight)
 
 
-def _misfit(rest: FloatArray, fresh: FloatArray, law: Batch, near: Batch) -> tuple[float, float]:
+def _misfit(rest: FloatArray, fresh: FloatArray, law: Batch, offset: FloatArray, noise: float) -> tuple[float, float]:
     """Misfit r' W r of the residual counts r, in standard deviations above its mean over fresh streams; its p-value.
+
+    `offset` (c,) expected counts, with `noise` times the variance of the recorded ones.
 
     The probability is that of two tests together: the weighted square of all cells, and the largest residual of the
     cumulated intervals, which is sensitive to a few missing or early intervals at the end of the dead time.
@@ -533,15 +557,14 @@ def _misfit(rest: FloatArray, fresh: FloatArray, law: Batch, near: Batch) -> tup
     from scipy.special import gammaincc, ndtr
 
     used = law.common
-    noise = 1.0 + near.ratio / len(near.counts)
     weight = law.weight[np.ix_(used, used)]
     drawn = np.einsum("ki,ij,kj->k", fresh[:, used], weight, fresh[:, used])
-    recorded = float(rest[used] @ weight @ rest[used]) / noise
+    recorded = float(rest[used] @ weight @ rest[used]) / (1.0 + noise)
     shape = drawn.mean() ** 2 / drawn.var()
     square = float(gammaincc(shape, recorded * shape / drawn.mean()))
     gaps = slice(law.cells.phases, law.cells.phases + law.cells.gap_edges.size)
-    enough = np.cumsum(near.offset[gaps]) > _CUMULATED
-    scatter = np.cumsum(fresh[:, gaps], axis=1).std(0)[enough] * noise**0.5
+    enough = np.cumsum(offset[gaps]) > _CUMULATED
+    scatter = np.cumsum(fresh[:, gaps], axis=1).std(0)[enough] * (1.0 + noise) ** 0.5
     departure = np.abs(np.cumsum(rest[gaps])[enough]) / scatter
     late = 2.0 * enough.sum() * float(ndtr(-departure.max(initial=0.0)))
     return float((recorded - drawn.mean()) / drawn.std()), min(1.0, 2.0 * min(square, late))

@@ -14,7 +14,7 @@ from mars_lidar._base.display import brief, measured
 from mars_lidar._base.resources import one_blas_thread
 from mars_lidar._base.types import ArrayLike, FloatArray, NDArray
 from mars_lidar.calibration import start, suspects
-from mars_lidar.calibration.fit import Effort, Fit, Fitted, Guess, draws
+from mars_lidar.calibration.fit import Effort, Fit, Fitted, Guess, draws, smaller_of
 from mars_lidar.calibration.look import Look, look_at
 from mars_lidar.calibration.model import Model, Waveform, all_carriers
 from mars_lidar.calibration.realizations import Realizations, realizations
@@ -294,7 +294,7 @@ def calibrate(
     >>> result.fits
     True
     >>> dead_time = result.estimates["dead_time_ns"]
-    >>> abs(dead_time.value - 50.0) < 4.0 * dead_time.error
+    >>> dead_time.low < 50.0 < dead_time.high
     True
     """
     number = checks.integer("returns", returns, low=1, high=4)
@@ -504,7 +504,7 @@ class _Run:
             named.append(Suspect(score.effect.words, score.z, at.value, at.error, gain, option, included=True))
         p = fitted.p_value if fitted.converged else 0.0
         if drift is not None:
-            p = min(1.0, 2.0 * min(p, drift.probability))
+            p = smaller_of(p, drift.probability)
             named += _changes(drift)
         if p < min(self.described.level, FALSE_ALARM) and all(suspect.included for suspect in named):
             named.append(_worst_cells(fitted))
@@ -615,7 +615,8 @@ def _estimates(fitted: Fitted, drift: Drift | None = None) -> dict[str, Estimate
         still = [name for name, factor in zip(names, growth, strict=True) if not factor > 1.0]
         withheld = dict.fromkeys(still, "of a model that does not fit: no error is stated")
     elif not fitted.lit:  # there may be another pulse
-        withheld = dict.fromkeys((*names[:k], "width", "jitter"), "no significant pulse: no error is stated")
+        words = "no significant pulse" if model.returns < 2 else "a return without significant signal"
+        withheld = dict.fromkeys((*names[:k], "width", "jitter"), f"{words}: no error is stated")
     if model.waveform is not None:  # which the shape follows
         withheld.setdefault("jitter", "beside light of free shape: no error is stated")
     notes: dict[str, str] = {}
@@ -639,7 +640,7 @@ def _estimates(fitted: Fitted, drift: Drift | None = None) -> dict[str, Estimate
             ends = [np.quantile(sample[rows], (0.025, 0.975)) for rows in covered]
             low, high = np.min(ends), np.max(ends)
             if name == "jitter_ns" and notes:  # equal tails would exclude zero
-                low, high = 0.0, np.quantile(sample, 0.95)
+                low, high = 0.0, max(np.quantile(sample, 0.95), *(end for _, end in ends[1:]), 0.0)
             error = float(((sample - value) ** 2).mean() ** 0.5)
             out[name] = Estimate(value, error, float(low), float(high), notes.get(name, ""))
     if fitted.by_shortest is not None:

@@ -26,7 +26,7 @@ class Cells:
         period, unit = model.clock.period_ns, model.clock.unit_ns
         gaps, phases = pilot.intervals, pilot.times / period % 1.0
         if not gaps.size:
-            raise ValueError("simulated streams of these parameters have no intervals")
+            raise ValueError("times must be those of photons, got a stream whose like cannot be simulated")
         edges, lit = self._layout(model, theta, phases)
         centre = (np.arange(_PHASES) + 0.5) / _PHASES
         # phases from which the dead time, or a shorter one that electronics' dead time hides, ends in a pulse

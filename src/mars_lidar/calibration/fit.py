@@ -489,7 +489,7 @@ class Fit:
 
         Then no count determines it: it ends where hardly any light is.
         """
-        place, root = fitted.model.light + 2, np.diag(np.full(len(free), error))
+        place, root = fitted.model.light + 2, np.diag(np.full(len(free), error / _FAR))
         known = np.isin(free, fitted.free)
         root[np.ix_(known, known)] = root_of(fitted.covariance)
         after = self.steps(Guess(fitted.model, fitted.theta, root, free), float(self.recording.photons), np.inf)[0]
@@ -567,4 +567,9 @@ def _misfit(rest: FloatArray, fresh: FloatArray, law: Batch, offset: FloatArray,
     scatter = np.cumsum(fresh[:, gaps], axis=1).std(0)[enough] * (1.0 + noise) ** 0.5
     departure = np.abs(np.cumsum(rest[gaps])[enough]) / scatter
     late = 2.0 * enough.sum() * float(ndtr(-departure.max(initial=0.0)))
-    return float((recorded - drawn.mean()) / drawn.std()), min(1.0, 2.0 * min(square, late))
+    return float((recorded - drawn.mean()) / drawn.std()), smaller_of(square, late)
+
+
+def smaller_of(*p_values: float) -> float:
+    """Probability that the smallest of so many independent p-values is at most the smallest of these."""
+    return float(-np.expm1(len(p_values) * np.log1p(-min(*p_values, 1.0 - 1e-16))))

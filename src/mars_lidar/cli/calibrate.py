@@ -292,9 +292,11 @@ def look_rows(result: Calibration) -> list[tuple[str, str]]:
 def fit_rows(result: Calibration) -> list[tuple[str, str]]:
     """Estimates, limits, drift, suspects, and the verdict."""
     rows = []
+    interval = f" photons in {result.recording.period_ns:.5g} ns, the mean interval"
+    units = _UNITS if result.recording.laser else dict.fromkeys(_UNITS, interval)
     for name, estimate in result.estimates.items():
         text, *ranges = str(estimate).split("; ")
-        text += _UNITS.get(name.split("_")[0], "")
+        text += units.get(name.split("_")[0], "")
         if name.startswith("delay") and estimate.error:
             text += f", {0.5 * SPEED_OF_LIGHT_M_PER_NS * estimate.value:.6g} m"
         rows.append((name, "; ".join([text, *ranges])))

@@ -640,7 +640,7 @@ def _estimates(fitted: Fitted, drift: Drift | None = None) -> dict[str, Estimate
             ends = [np.quantile(sample[rows], (0.025, 0.975)) for rows in covered]
             low, high = np.min(ends), np.max(ends)
             if name == "jitter_ns" and notes:  # equal tails would exclude zero
-                low, high = 0.0, max(np.quantile(sample, 0.95), *(end for _, end in ends[1:]), 0.0)
+                low, high = 0.0, max([np.quantile(sample, 0.95), *(end for _, end in ends[1:])])
             error = float(((sample - value) ** 2).mean() ** 0.5)
             out[name] = Estimate(value, error, float(low), float(high), notes.get(name, ""))
     if fitted.by_shortest is not None:

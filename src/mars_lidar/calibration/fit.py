@@ -26,7 +26,7 @@ _NEAR = 3.0  # standard errors of the recording about the estimate, from which t
 _FAR = 5.0  # standard errors of a dead time above that by the shortest interval, from which on it is fitted there, too
 _DOUBTFUL = 0.01  # p-value below which a fit is tested again
 _STREAMS = 64  # by so many streams
-_RETESTED = 3.2e7  # of so many photons at most
+_RETESTED = 1e8  # of so many photons at most
 _CUMULATED = 100.0  # intervals expected up to an edge, for a normal law of their number
 
 
@@ -449,8 +449,8 @@ class Fit:
             early, shortest = self.shortest(model, draws(model, raw, cov, free))
             dead, timed = shortest.dead_time(), free == model.light + 2
             error = float(np.sqrt(cov[timed, timed].sum()))
-            surely = early < 0.05 or shortest.decides(error)
-            if timed.any() and (surely or mean[model.light + 2] - dead[0] > _FAR * error):
+            surely = timed.any() and (early < 0.05 or shortest.decides(error))
+            if surely or (timed.any() and mean[model.light + 2] - dead[0] > _FAR * error):
                 at = mean.copy()
                 at[model.light + 2] = dead[0]
                 own = Guess(model, at, root_of(cov[np.ix_(~timed, ~timed)]), free[~timed])
@@ -480,14 +480,13 @@ class Fit:
         made = [law.cells.of(model.streams(row, cycles, self.next_seed())) for row in rows[:_STREAMS]]
         rest = (np.array(made) * (self.exposure(photons) / cycles) - offset) @ project.T
         mean = rest.mean(0)
-        return _misfit(
-            project @ (law.cells.of(self.recording) - offset) - mean, rest - mean, law, offset, 1 / len(rest)
-        )[1]
+        recorded = project @ (law.cells.of(self.recording) - offset) - mean
+        return _misfit(recorded, rest - mean, law, offset, 1.0 / len(rest))[1]
 
     def _stays(self, fitted: Fitted, before: FloatArray, error: float, free: Index) -> bool:
         """Whether steps of all free parameters from this fit do not return to the dead time `before`.
 
-        Then no count determines it: it ends where hardly any light is.
+        Then no count determines it: it ends where hardly any light is. Steps are short, beside the way between the two.
         """
         place, root = fitted.model.light + 2, np.diag(np.full(len(free), error / _FAR))
         known = np.isin(free, fitted.free)

@@ -248,7 +248,7 @@ def _cube(path: Path, known: KnownOptions, out: Path | None, picture: Path | Non
     rows = [("file", f"{path}: {counts.size // counts.shape[-1]:,} histograms of {counts.shape[-1]:,} bins")]
     units = {"background_floor": " photons per period, of the darkest of them"}
     units |= {name: _UNITS[name] for name in ("signal", "background")}
-    rows += [(name, f"{estimate}{units.get(name, '')}") for name, estimate in result.estimates.items()]
+    rows += [(name, _with_unit(str(estimate), units.get(name, ""))) for name, estimate in result.estimates.items()]
     if isinstance(result.system.pulse, SampledPulse) and result.response_error is not None:
         pulse = result.system.pulse
         worst = 100.0 * float(result.response_error.max() / pulse.values.max())
@@ -289,6 +289,12 @@ def look_rows(result: Calibration) -> list[tuple[str, str]]:
     return rows + [("problem", text) for text in look.problems]
 
 
+def _with_unit(text: str, unit: str) -> str:
+    """An estimate with its unit, before any note."""
+    value, comma, note = text.partition(", ")
+    return value + unit + comma + note
+
+
 def fit_rows(result: Calibration) -> list[tuple[str, str]]:
     """Estimates, limits, drift, suspects, and the verdict."""
     rows = []
@@ -296,7 +302,7 @@ def fit_rows(result: Calibration) -> list[tuple[str, str]]:
     units = _UNITS if result.recording.laser else dict.fromkeys(_UNITS, interval)
     for name, estimate in result.estimates.items():
         text, *ranges = str(estimate).split("; ")
-        text += units.get(name.split("_")[0], "")
+        text = _with_unit(text, units.get(name.split("_")[0], ""))
         if name.startswith("delay") and estimate.error:
             text += f", {0.5 * SPEED_OF_LIGHT_M_PER_NS * estimate.value:.6g} m"
         rows.append((name, "; ".join([text, *ranges])))

@@ -235,6 +235,11 @@ class Fitted:
     by_shortest: tuple[float, float, float] | None  # the dead time and its interval, if the counts do not determine it
 
     @property
+    def guess(self) -> Guess:
+        """This estimate, as the start of another fit."""
+        return Guess(self.model, self.theta, root_of(self.covariance), self.free)
+
+    @property
     def lit(self) -> bool:
         """Whether the signal of every return differs from zero (95 %)."""
         amounts = (self.free < self.model.light) & (self.free % 2 == 1)
@@ -443,7 +448,7 @@ class Fit:
         rest = project @ (recorded - near.offset - jacobian[:, at_bound] @ (mean - near.centre)[free[at_bound]])
         z, p = _misfit(rest, fresh, law, near.offset, near.ratio / len(near.counts))
         if p < _DOUBTFUL and effort.more > 1:
-            p = self._tested_again(model, draws(model, raw, cov, free), law, near.offset, unbound)
+            p = self._tested_again(model, draws(model, raw, cov, free), law, near.offset, unbound, recorded)
         interval = None
         if not (model.effects or model.fields):
             early, shortest = self.shortest(model, draws(model, raw, cov, free))
@@ -469,7 +474,7 @@ class Fit:
         return Fitted(model, free, mean, cov, raw, law, near.offset, *counts, z, p, bool(size.max() < _NEAR), interval)
 
     def _tested_again(
-        self, model: Model, rows: FloatArray, law: Batch, offset: FloatArray, project: FloatArray
+        self, model: Model, rows: FloatArray, law: Batch, offset: FloatArray, project: FloatArray, recorded: FloatArray
     ) -> float:
         """The p-value of the misfit by streams about as long as the recording, of parameters (n, p) from their law.
 
@@ -480,8 +485,7 @@ class Fit:
         made = [law.cells.of(model.streams(row, cycles, self.next_seed())) for row in rows[:_STREAMS]]
         rest = (np.array(made) * (self.exposure(photons) / cycles) - offset) @ project.T
         mean = rest.mean(0)
-        recorded = project @ (law.cells.of(self.recording) - offset) - mean
-        return _misfit(recorded, rest - mean, law, offset, 1.0 / len(rest))[1]
+        return _misfit(project @ (recorded - offset) - mean, rest - mean, law, offset, 1.0 / len(rest))[1]
 
     def _stays(self, fitted: Fitted, before: FloatArray, error: float, free: Index) -> bool:
         """Whether steps of all free parameters from this fit do not return to the dead time `before`.
@@ -500,8 +504,7 @@ class Fit:
         They differ by the noise of simulated streams, and where counts are not linear in the parameters. The covariance
         is the mean of both, since each has such noise too, and no error is smaller than the difference.
         """
-        guess = Guess(fitted.model, fitted.theta, root_of(fitted.covariance), fitted.free)
-        other = self.finish(guess, known=fitted.by_shortest is not None, again=False)
+        other = self.finish(fitted.guess, known=fitted.by_shortest is not None, again=False)
         free, change = other.free, np.zeros_like(other.theta)
         change[free] = (other.theta - fitted.theta)[free]
         same = np.isin(fitted.free, free)  # all but a dead time that has just been taken from the shortest interval

@@ -246,7 +246,7 @@ def refitted(scores: Scores, trials: list[Trial]) -> tuple[Fitted, list[tuple[Sc
             if not 0.5 * (score.z + again.z) > limit:
                 return (other, []) if fitted.p_value < FALSE_ALARM else None
     if trial.direct is None:
-        last = fit.finish(Guess(final.model, final.theta, root_of(final.covariance), final.free), finished=True)
+        last = fit.finish(final.guess, finished=True)
         if last.converged:
             own = scores.of(trial.effect, last.theta)
             final, score = last, max(trial.score, own, key=lambda score: score.z)

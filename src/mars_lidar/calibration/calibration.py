@@ -626,6 +626,7 @@ def _estimates(fitted: Fitted, drift: Drift | None = None) -> dict[str, Estimate
             notes = dict.fromkeys(("jitter_ns", "pulse_sigma_ns"), "not identified: any share of the recorded width")
     # near a bound of the angle the interval also covers the draws next to it
     covered = [slice(None), *(_at_bounds(fitted, errors["jitter"], drawn) if model.split else ())]
+    least = model.bounded(np.full(model.size, -np.inf))
     out: dict[str, Estimate] = {}
     for name, (exact, parameter) in values.items():
         value, sample = float(exact), samples[name][0]
@@ -639,7 +640,9 @@ def _estimates(fitted: Fitted, drift: Drift | None = None) -> dict[str, Estimate
         else:
             ends = [np.quantile(sample[rows], (0.025, 0.975)) for rows in covered]
             low, high = np.min(ends), np.max(ends)
-            if name == "jitter_ns" and notes:  # equal tails would exclude zero
+            if fitted.unbounded[index := names.index(parameter)] - 1.96 * errors[parameter] < least[index]:
+                low = sample.min()  # equal tails would exclude the bound
+            if name == "jitter_ns" and notes:
                 low, high = 0.0, max([np.quantile(sample, 0.95), *(end for _, end in ends[1:])])
             error = float(((sample - value) ** 2).mean() ** 0.5)
             out[name] = Estimate(value, error, float(low), float(high), notes.get(name, ""))

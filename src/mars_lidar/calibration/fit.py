@@ -23,7 +23,6 @@ from mars_lidar.calibration.shortest import Shortest, shortest_law
 Index: TypeAlias = NDArray[np.intp]
 LIGHTS = 16  # streams of one detector, in one call of the engine
 _NEAR = 3.0  # standard errors of the recording about the estimate, from which the last streams are drawn
-_FAR = 5.0  # standard errors of a dead time above that by the shortest interval, from which on it is fitted there, too
 _DOUBTFUL = 0.01  # p-value below which a fit is tested again
 _STREAMS = 64  # by so many streams
 _RETESTED = 1e8  # of so many photons at most
@@ -390,9 +389,8 @@ class Fit:
         (`again`).
 
         The dead time follows from the shortest interval alone (`known`) if that contradicts the 95 % interval of the
-        counts, or is more precise, or if counts claim over twice as much as intervals can tell; or where a fit at that
-        dead time, far below that of the counts, does not return to theirs. The other parameters are then fitted once
-        more at that dead time.
+        counts, or is more precise, or if counts claim over twice as much as intervals can tell. The other parameters
+        are then fitted once more at that dead time.
         """
         model, centre, root, free, law = guess
         photons, effort = float(self.recording.photons), self.effort
@@ -431,7 +429,7 @@ class Fit:
             root = root_of(cov)
             centre = centre + (mean - centre) / max(1.0, float(size.max()) / _NEAR)
         if any(model.names[index].startswith("log_") for index in free):
-            raw, cov = _curved(model, free, raw, cov, near, gain, recorded)
+            raw, cov = self._over_delays(Guess(model, raw, root_of(cov), free), law, near.offset, recorded)
             mean = most_probable(model, raw, cov, free)
         moved = np.abs((near.centre - guess.theta)[free]) / np.sqrt(np.diag(cov))
         if again and effort.more > 1 and moved.max() > _NEAR:
@@ -454,24 +452,75 @@ class Fit:
             early, shortest = self.shortest(model, draws(model, raw, cov, free))
             dead, timed = shortest.dead_time(), free == model.light + 2
             error = float(np.sqrt(cov[timed, timed].sum()))
-            surely = timed.any() and (early < 0.05 or shortest.decides(error))
-            if surely or (timed.any() and mean[model.light + 2] - dead[0] > _FAR * error):
+            if timed.any() and (early < 0.05 or shortest.decides(float(mean[model.light + 2]), error)):
                 at = mean.copy()
                 at[model.light + 2] = dead[0]
                 own = Guess(model, at, root_of(cov[np.ix_(~timed, ~timed)]), free[~timed])
-                stepped = self.steps(own, photons, photons / 6.0)[0]
-                for other in (by.finish(stepped, known=True) for by in (self.shorter, self)):  # the first costs less
-                    if not (other.converged and other.p_value > FALSE_ALARM):
-                        break
-                else:
-                    if surely or self._stays(other, mean, error, free):
-                        return other
+                other = self.finish(self.steps(own, photons, photons / 6.0)[0], known=True)
+                if other.converged and other.p_value > FALSE_ALARM:
+                    return other
             if known:
                 interval, mean[model.light + 2] = dead, dead[0]
             elif early < FALSE_ALARM:
                 p = min(p, early)
         counts = estimator, jacobian, rest, departure, fresh
         return Fitted(model, free, mean, cov, raw, law, near.offset, *counts, z, p, bool(size.max() < _NEAR), interval)
+
+    def _over_delays(
+        self, guess: Guess, law: Batch, offset: FloatArray, recorded: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Mean (p,) and covariance (free, free) of a model with afterpulses, from its likelihood at each mean delay.
+
+        That law is far from normal: afterpulses of long delays resemble background. In streams of all delays counts are
+        linear in the other parameters, and in products of the probability with powers of the logarithm of the delay.
+        """
+        model, theta, root, free, _ = guess
+        late = next(k for k, name in enumerate(model.names) if name.startswith("log_"))  # after the probability
+        others, varied = free[(free < late - 1) | (free > late)], free != late
+        photons, settings = float(self.recording.photons), self.effort.settings
+        least, most = (float(model.bounded(np.full(model.size, end))[late]) for end in (-np.inf, np.inf))
+        wide = _NEAR * root_of((root @ root.T)[np.ix_(varied, varied)])
+        cycles = max(2, round(self.exposure(self.effort.of(photons, self.effort.longer))))
+        ratio = self.exposure(photons) / cycles
+
+        def powers(delay: FloatArray) -> FloatArray:
+            return np.asarray(np.vander((2.0 * delay - least - most) / (most - least), 4, increasing=True))
+
+        def batch() -> tuple[FloatArray, FloatArray]:
+            rows = design(model, theta, wide, free[varied], self.next_seed(), settings)
+            rows[:, late] = np.repeat(self._random.permutation(np.linspace(least, most, settings)), LIGHTS)
+            counts = counted(model, law.cells, rows, cycles, self.next_seed())[0] * ratio - offset
+            return np.c_[(rows - theta)[:, others], rows[:, late - 1, None] * powers(rows[:, late])], counts
+
+        jacobian = least_squares(*batch())[0][1:].T
+        gain = np.linalg.inv(jacobian.T @ law.weight @ jacobian) @ jacobian.T @ law.weight
+        x, counts = batch()
+        slope, rest, inverse = least_squares(x, counts @ gain.T)
+        information, away = (
+            np.linalg.inv(rest.T @ rest / (len(rest) - len(slope))),
+            gain @ (recorded - offset) - slope[0],
+        )
+        # the others and the probability at each delay, as coefficients of all that counts are linear in
+        delays, n = np.linspace(least, most, 65), others.size
+        to = np.tile(np.eye(n + 4, n + 1), (delays.size, 1, 1))
+        to[:, n:, n] = powers(delays)
+        local, there = slope[1:].T @ to, np.tile(np.eye(1, n + 5), (delays.size, 1))
+        for _ in range(2):
+            noise = 1.0 / ratio + np.einsum("ki,ij,kj->k", there, inverse, there)
+            weighted = local.transpose(0, 2, 1) @ information / noise[:, None, None]
+            covariance = np.linalg.inv(weighted @ local)
+            values = covariance @ weighted @ away
+            there[:, 1:] = np.einsum("kij,kj->ki", to, values)
+        off = away - np.einsum("kij,kj->ki", local, values)
+        log = np.linalg.slogdet(covariance)[1] - away.size * np.log(noise)
+        log -= np.einsum("ki,ij,kj->k", off, information, off) / noise
+        weight = np.exp(0.5 * (log - log.max()))
+        weight /= weight.sum()
+        order, mean = np.argsort(np.r_[others, late - 1, late]), theta.copy()
+        values = np.c_[theta[others] + values[:, :n], values[:, n], delays][:, order]
+        mean[free] = weight @ values
+        within = np.pad(np.tensordot(weight, covariance, 1), (0, 1))[np.ix_(order, order)]
+        return mean, within + np.cov(values.T, aweights=weight, ddof=0)
 
     def _tested_again(
         self, model: Model, rows: FloatArray, law: Batch, offset: FloatArray, project: FloatArray, recorded: FloatArray
@@ -486,17 +535,6 @@ class Fit:
         rest = (np.array(made) * (self.exposure(photons) / cycles) - offset) @ project.T
         mean = rest.mean(0)
         return _misfit(project @ (recorded - offset) - mean, rest - mean, law, offset, 1.0 / len(rest))[1]
-
-    def _stays(self, fitted: Fitted, before: FloatArray, error: float, free: Index) -> bool:
-        """Whether steps of all free parameters from this fit do not return to the dead time `before`.
-
-        Then no count determines it: it ends where hardly any light is. Steps are short, beside the way between the two.
-        """
-        place, root = fitted.model.light + 2, np.diag(np.full(len(free), error / _FAR))
-        known = np.isin(free, fitted.free)
-        root[np.ix_(known, known)] = root_of(fitted.covariance)
-        after = self.steps(Guess(fitted.model, fitted.theta, root, free), float(self.recording.photons), np.inf)[0]
-        return bool(after.theta[place] < 0.5 * (fitted.theta[place] + before[place]))
 
     def repeated(self, fitted: Fitted) -> Fitted:
         """The mean of a fit and of one more from its place, with other cells, weights and simulated streams.
@@ -517,35 +555,6 @@ class Fit:
             covariance=covariance * np.outer(growth, growth),
             converged=fitted.converged and other.converged,
         )
-
-
-def _curved(
-    model: Model, free: Index, raw: FloatArray, cov: FloatArray, near: Batch, gain: FloatArray, own: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Mean (p,) and covariance (free, free) of parameters whose last one, a logarithm, also acts by its square.
-
-    `gain` gives an estimate for each stream `near` the centre, to which a law with the square of the logarithm and its
-    product with the size is fitted. Draws of the linear law are weighted by the likelihood, under this law, of the
-    estimate from the counts `own` (c,).
-    """
-    rows = draws(model, raw, 2.25 * cov, free)
-    at, counted = (rows - near.centre)[:, free], (near.counts - near.offset) @ gain.T
-
-    def squared(x: FloatArray) -> FloatArray:
-        return np.asarray(np.c_[x, x[:, -1:] * x[:, -2:]])
-
-    slope, rest, inverse = least_squares(squared((near.theta - near.centre)[:, free]), counted)
-    there = np.c_[np.ones(len(at)), squared(at)]
-    scale = (len(rest) - len(slope)) / (1.0 / near.ratio + np.einsum("ki,ij,kj->k", there, inverse, there))
-    off, out = gain @ (own - near.offset) - there @ slope, (rows - raw)[:, free]
-    log = np.einsum("ki,ij,kj->k", out, np.linalg.inv(2.25 * cov), out) + len(free) * np.log(scale)
-    log -= scale * np.einsum("ki,ij,kj->k", off, np.linalg.inv(rest.T @ rest), off)
-    weight = np.exp(0.5 * (log - log.max()))
-    if not weight.sum() ** 2 > 200.0 * (weight**2).sum():  # too few effective draws: the linear law is kept
-        return raw, cov
-    theta = near.centre.copy()
-    theta[free] += np.average(at, axis=0, weights=weight)
-    return theta, np.cov(at.T, aweights=weight)
 
 
 def _misfit(rest: FloatArray, fresh: FloatArray, law: Batch, offset: FloatArray, noise: float) -> tuple[float, float]:

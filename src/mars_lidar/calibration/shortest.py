@@ -53,34 +53,47 @@ class Shortest:
         return float(min(1.0, 2.0 * min(least, 1.0 - more)))
 
     def dead_time(self) -> tuple[float, float, float]:
-        """Median and 95 % interval of the dead time given the shortest interval, for a flat prior."""
-        return self._interval((self.none[0] - self.none[1]).mean(0))
+        """Median of the dead time given the shortest interval, for a flat prior, and its 95 % interval.
 
-    def decides(self, error: float) -> bool:
-        """Whether this law determines the dead time better than counts that give it a standard `error`, ns.
+        The interval is that of all laws together whose likelihood is within the 95 % region of the most likely: the
+        light that decides how far below the shortest interval the dead time may be is itself uncertain.
+        """
+        likely = self.none[0] - self.none[1]
+        total = self._cumulated(likely)[:, -1]
+        ends = self._quantiles(likely[total > np.exp(-0.5 * 1.96**2) * total.max()])
+        middle = self._quantiles(likely.mean(0, keepdims=True))[0, 1]
+        return float(middle), float(ends[:, 0].min()), float(ends[:, 2].max())
+
+    def decides(self, dead: float, error: float) -> bool:
+        """Whether this law determines the dead time better than counts by which it is `dead`, with a standard `error`.
 
         Their 95 % interval is over twice as wide as this one, or less than half as wide as all short intervals allow.
         """
         _, low, high = self.dead_time()
-        return 3.92 * error > 2.0 * (high - low) or 3.92 * error < 0.5 * self.narrowest()
+        return 3.92 * error > 2.0 * (high - low) or 3.92 * error < 0.5 * self.narrowest(dead)
 
-    def narrowest(self, cells: int = 12) -> float:
-        """Width of the 95 % interval of the dead time given all intervals that jitter brings near its end.
+    def narrowest(self, dead: float, cells: int = 12) -> float:
+        """Width of the 95 % interval of a dead time `dead`, ns, given the intervals that jitter brings near its end.
 
-        Their numbers in cells from the shortest interval on are Poisson; each law counts as much as its likelihood.
+        Their numbers in cells from the shortest interval on are Poisson, and as expected; the mean of all laws.
         """
         places = np.linspace(0.0, 1.0, cells) ** 2 * self.reach
         ends = self.recorded[0] + self.unit * np.unique(np.round(places / self.unit))
-        numbers = np.diff(np.searchsorted(self.recorded, np.r_[0.0, ends + 0.5 * self.unit]))
         below = np.array([self.expected(end) for end in (ends[0] - self.unit, *ends)])
-        log = (numbers[:, None, None] * np.log(np.maximum(np.diff(below, axis=0), 1e-300))).sum(0) - below[-1]
-        _, low, high = self._interval(np.exp(log - log.max()).sum(0))
-        return high - low
+        expected = np.maximum(np.diff(below, axis=0), 1e-300)
+        at = min(int(np.searchsorted(self.dead, dead)), self.dead.size - 1)
+        log = (expected[..., at, None] * np.log(expected)).sum(0) - below[-1]
+        return float(np.ptp(self._quantiles(np.exp(log - log.max(1, keepdims=True))), axis=1).mean())
 
-    def _interval(self, likely: FloatArray) -> tuple[float, float, float]:
-        share = np.r_[0.0, np.cumsum(0.5 * (likely[1:] + likely[:-1]) * np.diff(self.dead))]
-        low, middle, high = np.interp(np.array([0.025, 0.5, 0.975]) * share[-1], share, self.dead)
-        return float(middle), float(low), float(high)
+    def _cumulated(self, likely: FloatArray) -> FloatArray:
+        """Integral (laws, m) of likelihoods (laws, m) up to each dead time."""
+        parts = 0.5 * (likely[:, 1:] + likely[:, :-1]) * np.diff(self.dead)
+        return np.pad(np.cumsum(parts, axis=1), ((0, 0), (1, 0)))
+
+    def _quantiles(self, likely: FloatArray) -> FloatArray:
+        """Quantiles (laws, 3) of the dead time, of 2.5, 50 and 97.5 %, for likelihoods (laws, m)."""
+        shares = np.array([0.025, 0.5, 0.975])
+        return np.array([np.interp(shares * row[-1], row, self.dead) for row in self._cumulated(likely)])
 
 
 def shortest_law(recording: Recording, model: Model, rows: FloatArray, cycles: int, seed: int) -> Shortest:

@@ -444,6 +444,27 @@ def test_a_wrong_period_is_a_problem_of_the_look(period_ns: float) -> None:
     cycle = np.floor(times.times_ns / period_ns).astype(np.int32)
     wrong = replace(times, period_ns=period_ns, cycle=cycle, cycles=int(cycle[-1]) + 1)
     assert any("repeat every 100" in text for text in ml.calibrate(wrong, look=True).look.problems)
+    if period_ns == 83.0:  # 1600 ns is a period of 16 pulses
+        with pytest.raises(ValueError, match="must repeat with the laser period, but the photons repeat every 100"):
+            ml.calibrate(wrong)
+
+
+@pytest.mark.parametrize("background", [30.0, 300.0, 1000.0])
+def test_a_saturated_detector_has_no_period_of_its_own(background: float) -> None:
+    """Its intervals are nearly equal, but the phase of its counts is a random walk."""
+    for signal, dead in ((0.0, 50.0), (0.4, 33.3), (30.0, 170.0)):
+        times = stream(replace(BASE, unit=0.016, background=background, signal=signal, dead=dead), 30_000, 5)
+        assert ml.calibrate(times, look=True).look.problems == ()
+
+
+def test_a_time_without_photons_is_a_problem_of_the_look() -> None:
+    """Of 40 mean intervals, which constant light has with a probability of 3,000 exp(-40)."""
+    t, cycles = photon_by_photon(BASE, 3_000, 1)
+    gap = 40 * cycles // 3_000
+    t[1000:] += gap * BASE.period
+    look = ml.calibrate(as_timestamps(t, BASE, cycles + gap), look=True).look
+    assert look.dark_s == pytest.approx((1e-9 * t[999], 1e-9 * (t[1000] - t[999])))
+    assert any("no photon for" in text for text in look.problems)
 
 
 @pytest.mark.full

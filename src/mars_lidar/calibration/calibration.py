@@ -198,8 +198,9 @@ class Calibration:
         included = [suspect.name for suspect in self.suspects if suspect.included]
         model = "the model" + (f" with {' and '.join(included)}" if included else "")
         if not self.fitted.converged:
-            remedy = "give what is known (dead_time_ns, jitter_ns), pulse='free', returns=2, or a longer recording"
-            return f"the fit of {model} did not converge, nothing is estimated: {remedy}"
+            remedies = "give what is known (dead_time_ns, jitter_ns), pulse='free', returns=2, or a longer recording"
+            reason = "; ".join(self.look.problems) or remedies
+            return f"the fit of {model} did not converge, nothing is estimated: {reason}"
         outcome = f"is not rejected at the {self.level:.0%} level" if self.fits else "does not fit"
         return f"p = {self.p_value:.2g}: {model} {outcome}"
 
@@ -274,9 +275,10 @@ def calibrate(
     TypeError
         `times` are neither `Timestamps` nor numbers, `pulse` is not a pulse, or a switch is not True or False.
     ValueError
-        Several pixels without `pooled`, fewer than 300 registrations, records that are not photons, recordings with
-        different periods; a detector that is not free-running or has effects that one pixel cannot reveal; a pulse
-        that is given twice, or an afterpulse probability without a delay.
+        Several pixels without `pooled`, fewer than 300 registrations, records that are not photons, photons that repeat
+        with another period, recordings with different periods; a detector that is not free-running or has effects that
+        one pixel cannot reveal; light of free shape with several returns, a pulse that is given twice, or an afterpulse
+        probability without a delay.
 
     See Also
     --------
@@ -324,6 +326,10 @@ def calibrate(
             f"times must be of photons one after the other, got {same_time:,} of {recording.photons:,} at "
             "exactly the time of the one before"
         )
+    if recording.laser and described.look.own_period_ns is not None:
+        ratio = recording.period_ns / described.look.own_period_ns
+        if round(ratio) < 2 or abs(ratio - round(ratio)) > 1e-3:  # several pulses in a period repeat with it, too
+            raise ValueError(f"times must repeat with the laser period, but {described.look.problems[0]}")
     model = _model(recording, shape, number, fields, "jitter" in fixed)
     return _Run(described, model, fixed, start_seed).result()
 
@@ -377,6 +383,8 @@ def _model(recording: Recording, shape: Pulse | str, returns: int, fields: dict[
     if pulse is not None:
         pulse.check(recording.period_ns)
     if shape == "free":
+        if returns > 1:
+            raise ValueError(f"returns must be 1 with pulse='free', whose light has any shape, got {returns}")
         fine = recording.photons >= Effort.bin_photons * Effort.light_bins
         light = start.free_waveform(recording, Effort.light_bins if fine else Effort.shape_bins)
         return replace(model, waveform=Waveform(*light, recording.exposure, recording.period_ns, fine))
@@ -407,7 +415,7 @@ class _Run:
             drift = suspects.drift(fit, fitted) if included else drift
         if fitted.converged and not included:
             fitted = fit.repeated(fitted)
-        if attempt == 0 and not included and not wrong and fitted.p_value < FALSE_ALARM:
+        if attempt == 0 and fitted.converged and not included and not wrong and fitted.p_value < FALSE_ALARM:
             other = self.result(Effort.attempts)
             if other.fits:
                 return other

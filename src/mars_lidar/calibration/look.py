@@ -32,6 +32,9 @@ class Look:
         Number of records with exactly the time of the preceding record.
     own_period_ns
         Period of the photons if it differs from that of the laser, else None.
+    dark_s
+        Beginning and length, s, of the longest time without a photon, if constant light has one as long with a
+        probability below 0.2 %; else None.
     """
 
     registrations: int
@@ -45,6 +48,7 @@ class Look:
     quantiles_ns: FloatArray
     same_time: int
     own_period_ns: float | None
+    dark_s: tuple[float, float] | None
 
     __repr__ = brief
 
@@ -60,6 +64,11 @@ class Look:
         if self.own_period_ns is not None:
             given = "no laser was recorded" if np.isnan(self.period_ns) else f"not every {self.period_ns:.7g} ns"
             out.append(f"the photons repeat every {self.own_period_ns:.6g} ns, {given}: give that period")
+        if self.dark_s is not None:
+            out.append(
+                f"no photon for {self.dark_s[1]:.3g} s from {self.dark_s[0]:.3g} s on: interrupted, or dark; give the "
+                "stretches of constant light, in a list"
+            )
         if self.same_time:
             out.append(
                 f"{self.same_time:,} records at exactly the time of the preceding one: several detectors in one "
@@ -76,7 +85,27 @@ def look_at(recording: Recording) -> Look:
     period = recording.period_ns if recording.laser else float("nan")
     smallest, quantiles = gaps[:20], np.quantile(gaps, (0.01, 0.5, 0.99))
     same, own, unit, locked = int((gaps == 0.0).sum()), other_period(recording), clock.unit_ns, clock.locked
-    return Look(n, cycles, period, seconds, unit, locked, n / seconds, smallest, quantiles, same, own)
+    numbers = n, cycles, period, seconds, unit, locked, n / seconds, smallest, quantiles, same
+    return Look(*numbers, own, longest_dark(recording))
+
+
+def longest_dark(recording: Recording) -> tuple[float, float] | None:
+    """Beginning and length, s, of the longest time without a photon, if it is improbable in constant light; else None.
+
+    There one of the intervals exceeds x with a probability of about n exp(-x / m), n their number and m their mean: the
+    number of photons in a time is about Poisson, and less even only by effects of a detector that are small.
+    """
+    start, longest = 0.0, (0.0, 0.0)
+    for piece, cycles in zip(recording.pieces, recording.cycles, strict=True):
+        end = cycles * recording.period_ns
+        times = np.r_[0.0, piece, max(end, piece[-1])]
+        k = int(np.diff(times).argmax())
+        longest = max(longest, (float(times[k + 1] - times[k]), start + float(times[k])))
+        start += end
+    length, begin = longest
+    number = recording.photons
+    mean = (recording.exposure * recording.period_ns - length) / number
+    return (1e-9 * begin, 1e-9 * length) if number * np.exp(-length / mean) < FALSE_ALARM else None
 
 
 def other_period(recording: Recording, cells: int = 2**20, slowest: float = 0.3) -> float | None:
@@ -114,7 +143,19 @@ def other_period(recording: Recording, cells: int = 2**20, slowest: float = 0.3)
     if abs(first - given) < 1.5 or _is_harmonic(power, near, first, given):
         return None
     around = np.pad(power, (0, 1), "reflect")[first - 1 : first + 2]
-    return float(length * cell / (first + (around[2] - around[0]) / around.sum()))
+    period = float(length * cell / (first + (around[2] - around[0]) / around.sum()))
+    return period if _in_phase(times / period) else None
+
+
+def _in_phase(periods: FloatArray, parts: int = 16) -> bool:
+    """Whether times (n,), in periods, keep their phase: its mean in parts scatters less than the times in each do.
+
+    The intervals of a saturated detector are nearly equal, and the phase of such times is a random walk.
+    """
+    means = np.array([np.exp(2j * np.pi * part).mean() for part in np.array_split(periods, parts)])
+    phase, place = np.unwrap(np.angle(means)), np.arange(parts)
+    off = phase - np.polyval(np.polyfit(place, phase, 1), place)  # the period is known to part of a line
+    return bool((off**2).mean() < 0.25 * -2.0 * np.log(np.abs(means).mean()))
 
 
 def _is_harmonic(power: FloatArray, near: FloatArray, line: int, given: float) -> bool:

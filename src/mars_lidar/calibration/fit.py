@@ -130,9 +130,11 @@ class Batch(NamedTuple):
     def one_count(self, model: Model, free: Index) -> FloatArray:
         """Covariance (free, free) that one registration more or less adds to background and signals.
 
-        It is the inverse square of the sum of the positive slopes; without it an amount of no counts has no error.
+        It is the inverse square of the sum of the positive slopes of phases or intervals; without it an amount of no
+        counts has no error. Only the intervals of a saturated detector depend on its light.
         """
-        rise = np.maximum(self.slope[: self.cells.phases, free], 0.0).sum(0)
+        positive, phases = np.maximum(self.slope[:, free], 0.0), self.cells.phases
+        rise = np.maximum(positive[:phases].sum(0), positive[phases : phases + self.cells.gap_edges.size + 1].sum(0))
         amount = (free == 0) | ((free < model.light) & (free % 2 == 1))
         return np.diag(amount / np.maximum(rise, 1.0 / model.scale(self.centre)[free]) ** 2)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -31,6 +32,7 @@ from mars_lidar.light.timestamps import Timestamps
 
 _SAME_TIME = 0.01  # fraction of records at exactly the time of the preceding one, above which they are not photons
 LEVEL = 0.01  # false-alarm probability of the verdict
+_NOT_LINEAR = 0.5  # photons: an error of a signal that is not small beside 1, over which exp(-signal) changes
 
 GIVEN = (
     *("dead_time_ns", "jitter_ns", "pulse_sigma_ns", "twilight_ns", "recovery_ns", "electronics_dead_time_ns"),
@@ -472,10 +474,11 @@ class _Run:
         known = {*self.fixed} if model.gaussian else {*self.fixed, "width"}
         free = np.array([k for k, name in enumerate(model.names) if name not in known], np.intp)
         first, photons = fit.effort.first, float(fit.recording.photons)
-        tried = []
-        for _, theta in start.starts(fit, model, self.fixed)[:2]:
-            trial = Guess(model, theta, np.diag(0.5 * model.scale(theta)[free]), free)
-            tried.append(fit.steps(trial, min(photons, first)))
+        places = [theta for _, theta in start.starts(fit, model, self.fixed)]
+        guesses = [Guess(model, theta, np.diag(0.5 * model.scale(theta)[free]), free) for theta in places[:2]]
+        tried = [fit.steps(guesses[0], min(photons, first))]
+        with suppress(ValueError):  # steps from the second best place may lead to no photons
+            tried.append(fit.steps(guesses[1], min(photons, first)))
         early, _, settled = min(tried, key=lambda trial: trial[1])
         guess, error = early, np.linalg.norm(early.root, axis=1)
         if first < photons:
@@ -652,8 +655,10 @@ def _estimates(fitted: Fitted, drift: Drift | None = None) -> dict[str, Estimate
                 low = sample.min()  # equal tails would exclude the bound
             if name == "jitter_ns" and notes:
                 low, high = 0.0, max([np.quantile(sample, 0.95), *(end for _, end in ends[1:])])
-            error = float(((sample - value) ** 2).mean() ** 0.5)
-            out[name] = Estimate(value, error, float(low), float(high), notes.get(name, ""))
+            error, note = float(((sample - value) ** 2).mean() ** 0.5), notes.get(name, "")
+            if name.startswith("signal") and error > _NOT_LINEAR and 4.0 * centre[k] < centre[k + 2]:
+                error, high, note = np.nan, np.inf, "nearly every pulse is recorded"
+            out[name] = Estimate(value, error, float(low), float(high), note)
     if fitted.by_shortest is not None:
         value, low, high = fitted.by_shortest
         out["dead_time_ns"] = Estimate(value, np.nan, low, high, "by the shortest interval alone")

@@ -242,10 +242,10 @@ class Fitted:
 
     @property
     def lit(self) -> bool:
-        """Whether the signal of every return differs from zero (95 %)."""
+        """Whether the signal of every return differs from zero (95 %), by the probability exp(-signal) of no photon."""
         amounts = (self.free < self.model.light) & (self.free % 2 == 1)
         signal, variance = self.theta[self.free[amounts]], np.diag(self.covariance)[amounts]
-        return bool((signal >= 1.96 * variance**0.5).all())
+        return bool((signal >= np.log1p(1.96 * variance**0.5)).all())
 
 
 def most_probable(model: Model, theta: FloatArray, covariance: FloatArray, free: Index) -> FloatArray:

@@ -20,6 +20,7 @@ from mars_lidar.instrument.pulse import GaussianPulse, Pulse
 from mars_lidar.instrument.system import System
 from mars_lidar.instrument.tolerances import TOL
 from mars_lidar.light.flux import Flux
+from mars_lidar.light.tolerances import TOL as LIGHT
 
 _NARROWEST = 2e-6  # periods: the narrowest pulse that the engines draw
 _WIDEST = 0.3  # sigma of a recorded pulse, periods: a wider one is hardly distinguished from background
@@ -180,7 +181,8 @@ class Model:
         k, period = self.light, self.clock.period_ns
         jitter = TOL.jitter_periods * period
         least = [1e-7, *(0.0, -np.inf) * self.returns, _NARROWEST * period, 0.0, 0.0]
-        most = [*(np.inf,) * k, _WIDEST * period, np.pi / 2.0 if self.split else jitter, np.inf]
+        amounts = LIGHT.photons, *(LIGHT.photons, np.inf) * self.returns
+        most = [*amounts, _WIDEST * period, np.pi / 2.0 if self.split else jitter, np.inf]
         for effect in self.effects:
             least += effect.least
             most += effect.most

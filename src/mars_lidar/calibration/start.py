@@ -81,24 +81,44 @@ def starts(fit: Fit, model: Model, fixed: dict[str, float]) -> list[tuple[float,
     photons = min(recording.photons, fit.effort.first)
     observed, _ = _short_intervals(fit)
     hold = max(4 * observed[-3] - 3 * observed[0], fixed.get("dead_time_ns", 0.0)) + 2 * unit
+    hold = min(hold, float(np.quantile(recording.intervals, 0.95)))  # of a saturated detector few are longer
     if model.returns == 0:
         first = np.array([free_waveform(recording, 64)[0].sum(), max((observed[-3] - observed[0]) / 4, 0.3 * unit)])
     else:
         first = light(recording.pieces[0][: 12 * photons], model, hold)
-    trials = []
+    tried = []
     # from no jitter to a width of jitter alone
     for angle in np.linspace(0.0, np.pi / 2.0, 1 if "jitter" in fixed else 7):
         theta = np.r_[first, 0.0, 0.0]
         theta[k + 1] = fixed.get("jitter", angle if model.split else np.sin(angle) * theta[k])
         theta[k + 2] = fixed.get("dead_time_ns", max(observed[0], 0.05 * observed[-1]) + 2 * model.widths(theta)[1])
-        if "dead_time_ns" not in fixed:
-            theta = with_edge(fit, model, theta)
+        tried.append(theta if "dead_time_ns" in fixed else with_edge(fit, model, theta))
+    trials = []
+    for theta in (*tried, saturated(recording.intervals, model, np.r_[first, 0.0, 0.0], fixed)):
         cells = fit.cells(model, theta, photons)
         rows = cells.count(fit.streams(model, theta, photons))[:, 0]
         recorded = cells.of(recording) * (photons / recording.photons)
         r = (2 * np.sqrt(recorded + 0.375) - 2 * np.sqrt(rows + 0.375).mean(0)) ** 2
         trials.append((float(r.sum()), theta))
     return sorted(trials, key=lambda pair: pair[0])
+
+
+def saturated(gaps: FloatArray, model: Model, theta: FloatArray, fixed: dict[str, float]) -> FloatArray:
+    """Parameters (p,) by the moments of the intervals, which in constant light are t_d + an exponential + the jitter.
+
+    Their third central moment is that of the exponential alone. In pulsed light this holds if the detector is
+    saturated, where no interval is long enough to count photons that the dead time does not hide.
+    """
+    k, theta, off = model.light, theta.copy(), gaps - gaps.mean()
+    mean = float(gaps.mean())
+    wait = float(np.clip(0.5 * (off**3).mean(), (1e-4 * mean) ** 3, (0.99 * mean) ** 3)) ** (1.0 / 3.0)
+    jitter = fixed.get("jitter", (0.5 * max(float(gaps.var()) - wait**2, 0.0)) ** 0.5)
+    amounts = [0, *range(1, k, 2)]
+    theta[amounts] *= model.clock.period_ns / wait / theta[amounts].sum()
+    theta[k] = max(float(theta[k]), jitter)
+    theta[k + 1] = np.arcsin(jitter / theta[k]) if model.split else jitter
+    theta[k + 2] = fixed.get("dead_time_ns", mean - wait)
+    return model.bounded(theta)
 
 
 def _short_intervals(fit: Fit) -> tuple[FloatArray, FloatArray]:
@@ -155,5 +175,6 @@ def brightest_window(recording: Recording) -> tuple[float, float]:
         inside, variance = (sum(np.roll(part, -k) for k in range(m)) for part in (rate, error**2))
         excess = inside - share * (rate.sum() - inside)
         noise = np.sqrt(variance + share**2 * ((error**2).sum() - variance))
-        best, limit = max(best, float((excess / noise).max())), max(limit, float((excess + 1.645 * noise).max()))
+        most = np.where(noise > 1.0, np.inf, excess + 1.645 * noise)  # hardly a pass without a photon
+        best, limit = max(best, float((excess / noise).max())), max(limit, float(most.max()))
     return float(widths.size * rate.size * ndtr(-best)), limit

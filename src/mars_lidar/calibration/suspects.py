@@ -355,6 +355,9 @@ def drift(fit: Fit, fitted: Fitted) -> Drift | None:
     exposures = np.array([part.exposure for part in parts])
     share = exposures / exposures.sum()
     noise = (fitted.noise @ estimator.T).std(0)  # of the whole recording
+    # counts of a saturated detector are so even that it matters where in a period, or between counts, a part ends
+    end = 0.5 * (1.0 + recording.photons / recording.exposure) / response[: batch.cells.phases, 0].sum()
+    noise[0] = np.hypot(noise[0], end * len(parts) ** 0.5)
     sd = noise * len(parts) ** 0.5  # of a part of mean exposure
     ends = np.cumsum(np.r_[0.0, exposures])
     middle = 0.5 * (ends[1:] + ends[:-1]) * recording.period_ns * 1e-9

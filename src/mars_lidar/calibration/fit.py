@@ -375,11 +375,10 @@ class Fit:
 
         The fit counts intervals in cells, without their places within a cell, so that it does not use this interval.
         """
-        k, size = model.light + 2, self.effort.of(float(self.recording.photons))
+        k = model.light + 2
         parts = np.array_split(rows[np.argsort(rows[:, k - 1])], 2 * LIGHTS)  # of about the same jitter each
         middles = np.array([part[len(part) // 2] for part in parts])
-        cycles = max(2, round(self.exposure(size)))
-        law = shortest_law(self.recording, model, middles, cycles, self.next_seed())
+        law = shortest_law(self.recording, model, middles, self.next_seed())
         return law.p_value([part[:, k] for part in parts]), law
 
     def finish(self, guess: Guess, known: bool = False, finished: bool = False, again: bool = True) -> Fitted:

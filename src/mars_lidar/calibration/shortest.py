@@ -13,15 +13,17 @@ their number is a Poisson number: none is recorded with the probability exp(-H).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from mars_lidar._base.cached import cached_property
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration.model import Model
-from mars_lidar.calibration.recording import Clock, Recording
+from mars_lidar.calibration.recording import Recording
 from mars_lidar.statistics.cells import photons_per_bin
+from mars_lidar.statistics.chain import ConvergenceError
+from mars_lidar.statistics.histogram import registration_pdf
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,21 +98,24 @@ class Shortest:
         return np.array([np.interp(shares * row[-1], row, self.dead) for row in self._cumulated(likely)])
 
 
-def shortest_law(recording: Recording, model: Model, rows: FloatArray, cycles: int, seed: int) -> Shortest:
+def shortest_law(recording: Recording, model: Model, rows: FloatArray, seed: int) -> Shortest:
     """The law of the shortest interval as a function of the dead time, for each row of parameters (laws, p).
 
-    The phases of registrations are those of streams of `cycles` periods. The dead times lie closest near the shortest
-    interval.
+    The phases of registrations are those of the stationary law of the middle row. The dead times lie closest near the
+    shortest interval.
     """
     from scipy.special import ndtr
 
-    bins, nodes = 2**14, 2000  # of the light in a period; of the dead times on each side of the shortest interval
+    nodes = 2000  # of the dead times on each side of the shortest interval
     period, clock, x = model.clock.period_ns, model.clock, float(recording.intervals[0])
-    middle = np.tile(rows[len(rows) // 2], (len(rows), 1))
-    drawn = replace(model, clock=Clock(period)).streams(middle, cycles, seed, jitter=False).times
-    phases = np.bincount((drawn / period * bins).astype(np.int64) % bins, minlength=bins) / drawn.size
     flux = model.flux(rows, round(recording.exposure), seed)
     systems = [model.system(row, 2, jitter=False) for row in rows]
+    middle, of = flux[:, len(rows) // 2 : len(rows) // 2 + 1], systems[len(rows) // 2]
+    try:
+        phases = registration_pdf(middle, of.replace(bins=2**14), "stationary")[0, 0]
+    except ConvergenceError:  # of a saturated detector, whose phases are even
+        phases = registration_pdf(middle, of.replace(bins=2**12), "stationary")[0, 0]
+    bins = phases.size
     light = np.array([photons_per_bin(flux[:, k : k + 1], s, bins=bins)[0, 0] for k, s in enumerate(systems)])
     rate = np.fft.irfft(np.conj(np.fft.rfft(phases)) * np.fft.rfft(light), bins) * (recording.photons * bins / period)
     sd = np.maximum(2.0**0.5 * model.widths(rows)[1], 1e-6)  # ns, of an interval

@@ -125,6 +125,9 @@ def test_a_dead_time_that_two_early_intervals_refuse() -> None:
     dead = result.estimates["dead_time_ns"]
     assert np.isnan(dead.error)
     assert dead.low <= truth.dead <= dead.high < dead.low + 0.6
+    # the law of the shortest interval is exact: by simulated phases the low end was 16.20 to 16.37, by the seed
+    again = ml.calibrate(stream(truth, photons, 3142), seed=1).estimates["dead_time_ns"]
+    assert abs(again.low - dead.low) < 0.01
 
 
 GAP = Truth(signal=1.2, background=0.02, delay=10.0, sigma=2.0, dead=75.0, period=50.0, unit=0.064)
@@ -193,6 +196,17 @@ def test_a_dead_time_that_ends_in_the_dark(seed: int) -> None:
     """Without background it may end anywhere between two pulses: 98.91 ± 0.35 ns was stated for 50."""
     truth = replace(BASE, background=0.0)
     dead = ml.calibrate(stream(truth, 20_000, seed), seed=seed - 1).estimates["dead_time_ns"]
+    assert dead.low <= truth.dead <= dead.high
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("seed", [1, *nightly(2)])
+def test_a_dead_time_that_ends_in_a_faint_background(seed: int) -> None:
+    """Beside a jitter of the whole width 167.4 ± .6 ns was stated for 157.7: no photon tells, between 135 and 168."""
+    truth = replace(BASE, signal=2.066, background=2e-5, delay=31.8, sigma=0.037, jitter=0.275)
+    truth = replace(truth, dead=157.7, period=33.576, unit=0.097)
+    dead = ml.calibrate(stream(truth, 20_000, seed), seed=seed).estimates["dead_time_ns"]
+    assert np.isnan(dead.error)
     assert dead.low <= truth.dead <= dead.high
 
 
@@ -427,7 +441,8 @@ def test_even_counts_of_a_bright_pulse_do_not_flicker() -> None:
     result = ml.calibrate(stream(truth, 40_000, 2), seed=2)
     assert result.fits
     assert not result.suspects
-    assert (np.abs(pulls(result, truth)) < FAR).all()
+    assert not (np.abs(pulls(result, truth)) > FAR).any()
+    assert result.estimates["signal"].low < 10.0 < result.estimates["signal"].high
 
 
 def test_a_look_stops_before_the_fit() -> None:
@@ -465,6 +480,51 @@ def test_a_time_without_photons_is_a_problem_of_the_look() -> None:
     look = ml.calibrate(as_timestamps(t, BASE, cycles + gap), look=True).look
     assert look.dark_s == pytest.approx((1e-9 * t[999], 1e-9 * (t[1000] - t[999])))
     assert any("no photon for" in text for text in look.problems)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("seed", [3, *nightly(0, 1, 2)])
+def test_afterpulses_that_resemble_background(seed: int) -> None:
+    """Mean delay of ten dead times: a law linear about a delay of 143 ns gave a background 5.5 errors too high."""
+    truth = replace(BASE, afterpulses=0.1, afterpulse_delay=500.0)
+    result = ml.calibrate(stream(truth, 60_000, seed), seed=seed)
+    assert [suspect.name for suspect in result.suspects] == ["afterpulses"]
+    assert (np.abs(pulls(result, truth)) < 3.5).all()
+    delay = result.estimates["afterpulse_delay_ns"]
+    assert delay.least < 500.0 < delay.most
+
+
+@pytest.mark.full
+def test_the_light_of_a_saturated_detector() -> None:
+    """A hundred photons a period hardly change the number of counts (error of 21 %), but their intervals."""
+    truth = replace(BASE, background=100.0, unit=0.016)
+    result = ml.calibrate(stream(truth, 30_000, 5), seed=1)
+    assert result.fits
+    assert not result.suspects
+    light, dead = result.estimates["light"], result.estimates["dead_time_ns"]
+    assert light.error < 1.5
+    assert abs(light.value - 100.4) < 3.5 * light.error
+    assert abs(dead.value - 50.0) < 3.5 * dead.error < 0.02
+
+
+@pytest.mark.full
+def test_a_pulse_that_is_nearly_always_recorded_has_no_upper_end() -> None:
+    """Of a signal of 40 photons 11 +- 3 was stated: none of the pulses is missed."""
+    truth = replace(BASE, signal=40.0, sigma=0.03, jitter=0.3, unit=0.016)
+    signal = ml.calibrate(stream(truth, 30_000, 2), seed=2).estimates["signal"]
+    assert np.isnan(signal.error)
+    assert 4.0 < signal.low < 40.0
+    assert np.isinf(signal.high)
+    assert "nearly every pulse" in signal.note
+
+
+@pytest.mark.full
+def test_the_last_part_of_even_counts_is_no_drift() -> None:
+    """Counts of a saturated detector scatter by less than one; the recording ends within a period (p = 5e-12)."""
+    truth = replace(BASE, background=300.0, unit=0.016)
+    result = ml.calibrate(stream(truth, 40_000, 2), seed=2)
+    assert result.fits
+    assert not result.suspects
 
 
 @pytest.mark.full

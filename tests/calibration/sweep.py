@@ -1,7 +1,8 @@
 """Pulls of `calibrate` over random streams of the independent simulator: ``python -m tests.calibration.sweep 0 40``.
 
 A stream a number: light, jitter, clock, period, dead time and photons are drawn from the seed of that number, or are
-those of `ORDINARY` with ``--ordinary``; with ``--effect NAME``, or ``NAME+NAME``, the detector has these effects too.
+those of `ORDINARY` with ``--ordinary``; with ``--effect NAME``, or ``NAME+NAME``, the detector has these effects too;
+with ``--background LOW HIGH`` the background is drawn from that range instead, evenly in its logarithm.
 Prints a line a stream, and the spread of the pulls; with ``--keep FILE`` results are appended to that file, a JSON
 object a line, and streams that it has are not calibrated again.
 """
@@ -134,18 +135,20 @@ def main() -> None:
     parser.add_argument("--effect", help=f"{', '.join(EFFECTS)}; or two, with a plus between them")
     parser.add_argument("--ordinary", action="store_true")
     parser.add_argument("--photons", type=int)
+    parser.add_argument("--background", type=float, nargs=2)
     parser.add_argument("--keep", type=Path)
     parser.add_argument("--kept", action="store_true", help="only the streams of FILE, as the tables of the docs")
     asked = parser.parse_args()
     lines = asked.keep.read_text().splitlines() if asked.keep is not None and asked.keep.exists() else []
     stored = [json.loads(line) for line in lines]
-    wanted = (asked.effect, asked.photons, asked.ordinary)
-    done = {row["number"]: row for row in stored if (row["effect"], row["asked"], row["ordinary"]) == wanted}
+    wanted = (asked.effect, asked.photons, asked.ordinary, asked.background)
+    of = [(row["effect"], row["asked"], row["ordinary"], row.get("range")) for row in stored]
+    done = {row["number"]: row for row, own in zip(stored, of, strict=True) if own == wanted}
     rows = []
     for number in range(asked.first, asked.last):
         if asked.kept and number not in done:
             continue
-        row = done.get(number) or calibrated(number, asked.effect, asked.photons, asked.ordinary)
+        row = done.get(number) or calibrated(number, *wanted)
         rows.append(row)
         if number not in done and asked.keep is not None:
             with asked.keep.open("a") as file:
@@ -222,9 +225,14 @@ def named(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def calibrated(number: int, effect: str | None, photons: int | None, ordinary: bool) -> dict[str, Any]:
+def calibrated(
+    number: int, effect: str | None, photons: int | None, ordinary: bool, background: list[float] | None = None
+) -> dict[str, Any]:
     """The pulls, p-value, suspects and time of one stream."""
     truth, own = (ORDINARY, 100_000) if ordinary else random_truth(number)
+    if background is not None:
+        drawn = np.random.default_rng(number).uniform(*np.log(background))
+        truth = replace(truth, background=float(np.exp(drawn)))
     truth = with_effect(truth, effect)
     t, cycles = photon_by_photon(truth, photons or own, number)
     began = time.process_time()
@@ -234,6 +242,7 @@ def calibrated(number: int, effect: str | None, photons: int | None, ordinary: b
         "effect": effect,
         "asked": photons,
         "ordinary": ordinary,
+        "range": background,
         "photons": t.size,
         "seconds": time.process_time() - began,
         "p": float(result.p_value),

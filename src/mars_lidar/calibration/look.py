@@ -92,8 +92,8 @@ def look_at(recording: Recording) -> Look:
 def longest_dark(recording: Recording) -> tuple[float, float] | None:
     """Beginning and length, s, of the longest time without a photon, if it is improbable in constant light; else None.
 
-    There one of the intervals exceeds x with a probability of about n exp(-x / m), n their number and m their mean: the
-    number of photons in a time is about Poisson, and less even only by effects of a detector that are small.
+    The n times of constant light divide a recording T into intervals of which one exceeds x with a probability of at
+    most (n + 1) (1 - x / T)^n, or with n - 2 where it begins and ends at a photon. Counts of a detector are more even.
     """
     start, longest = 0.0, (0.0, 0.0)
     for piece, cycles in zip(recording.pieces, recording.cycles, strict=True):
@@ -103,9 +103,9 @@ def longest_dark(recording: Recording) -> tuple[float, float] | None:
         longest = max(longest, (float(times[k + 1] - times[k]), start + float(times[k])))
         start += end
     length, begin = longest
-    number = recording.photons
-    mean = (recording.exposure * recording.period_ns - length) / number
-    return (1e-9 * begin, 1e-9 * length) if number * np.exp(-length / mean) < FALSE_ALARM else None
+    dark = length / (recording.exposure * recording.period_ns)
+    chance = (recording.photons + 1) * max(1.0 - dark, 0.0) ** (recording.photons - 2)
+    return (1e-9 * begin, 1e-9 * length) if chance < FALSE_ALARM else None
 
 
 def other_period(recording: Recording, cells: int = 2**20, slowest: float = 0.3) -> float | None:

@@ -651,8 +651,9 @@ def _estimates(fitted: Fitted, drift: Drift | None = None) -> dict[str, Estimate
         else:
             ends = [np.quantile(sample[rows], (0.025, 0.975)) for rows in covered]
             low, high = np.min(ends), np.max(ends)
-            if fitted.unbounded[index := names.index(parameter)] - 1.96 * errors[parameter] < least[index]:
-                low = sample.min()  # equal tails would exclude the bound
+            index = names.index(parameter)
+            if index < k and fitted.unbounded[index] - 1.96 * errors[parameter] < least[index]:
+                low = sample.min()  # equal tails would exclude a light of zero
             if name == "jitter_ns" and notes:
                 low, high = 0.0, max([np.quantile(sample, 0.95), *(end for _, end in ends[1:])])
             error, note = float(((sample - value) ** 2).mean() ** 0.5), notes.get(name, "")

@@ -23,6 +23,7 @@ from mars_lidar.calibration.shortest import Shortest, shortest_law
 Index: TypeAlias = NDArray[np.intp]
 LIGHTS = 16  # streams of one detector, in one call of the engine
 _NEAR = 3.0  # standard errors of the recording about the estimate, from which the last streams are drawn
+_WIDER = 4.0  # standard errors of the logarithm of a mean delay, by a normal law, within which it may lie
 _DOUBTFUL = 0.01  # p-value below which a fit is tested again
 _STREAMS = 64  # by so many streams
 _RETESTED = 1e8  # of so many photons at most
@@ -472,14 +473,16 @@ class Fit:
     ) -> tuple[FloatArray, FloatArray]:
         """Mean (p,) and covariance (free, free) of a model with afterpulses, from its likelihood at each mean delay.
 
-        That law is far from normal: afterpulses of long delays resemble background. In streams of all delays counts are
-        linear in the other parameters, and in products of the probability with powers of the logarithm of the delay.
+        That law is far from normal: afterpulses of long delays resemble background. In streams of all delays within
+        `_WIDER` errors of the guess counts are linear in the other parameters, and in products of the probability with
+        powers of the logarithm of the delay.
         """
         model, theta, root, free, _ = guess
         late = next(k for k, name in enumerate(model.names) if name.startswith("log_"))  # after the probability
         others, varied = free[(free < late - 1) | (free > late)], free != late
         photons, settings = float(self.recording.photons), self.effort.settings
-        least, most = (float(model.bounded(np.full(model.size, end))[late]) for end in (-np.inf, np.inf))
+        reach = _WIDER * float(np.linalg.norm(root[~varied]))
+        least, most = (float(model.bounded(np.full(model.size, theta[late] + end))[late]) for end in (-reach, reach))
         wide = _NEAR * root_of((root @ root.T)[np.ix_(varied, varied)])
         cycles = max(2, round(self.exposure(self.effort.of(photons, self.effort.longer))))
         ratio = self.exposure(photons) / cycles

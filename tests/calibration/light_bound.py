@@ -45,7 +45,7 @@ def main() -> None:
         row = json.loads(line)
         truth, photons = random_truth(row["number"])
         stated = np.isfinite(np.array(row["errors"], float)).all()
-        if row["effect"] or row["asked"] or not stated or truth.jitter > 0.1 * truth.dead:
+        if row["effect"] or row["asked"] or row.get("range") or not stated or truth.jitter > 0.1 * truth.dead:
             continue
         t, _ = photon_by_photon(truth, photons, row["number"])
         ratios.append(np.array(row["errors"][:2]) / bound(truth, t))

@@ -148,11 +148,11 @@ def test_the_law_of_the_shortest_interval(jitter: float) -> None:
     row = np.array([[0.05, 1.2, 10.0, truth.width, jitter, 75.0]])
     below, held, narrower = [], 0, []
     for seed in range(60):
-        law = shortest_law(recording_of(stream(truth, 300, seed)), model, row, 20_000, seed)
+        law = shortest_law(recording_of(stream(truth, 300, seed)), model, row, seed)
         below.append(np.interp(75.0, law.dead, 0.5 * sum(law.none)[0]))
         _, low, high = law.dead_time()
         held += low <= 75.0 <= high
-        narrower.append(law.narrowest() / (high - low))
+        narrower.append(law.narrowest(75.0) / (high - low))
     # without jitter no interval but the shortest depends on the dead time; with it all near its end do
     assert 0.9 < min(narrower) <= max(narrower) < 1.1 if jitter == 0.0 else np.mean(narrower) < 1.0
     assert kstest(below, "uniform").pvalue > 1e-3
@@ -248,7 +248,7 @@ def test_intervals_that_jitter_reverses_are_sorted() -> None:
     truth = Truth(signal=0.4, background=0.4, delay=30.0, sigma=0.3, dead=12.0, period=100.0, jitter=4.0, unit=0.064)
     model = Model(Clock(100.0, 0.064, 0.5, locked=True), 1, jitter_given=True)
     row = np.array([[0.4, 0.4, 30.0, truth.width, 4.0, 12.0]])
-    law = shortest_law(recording_of(stream(truth, 800_000, 1)), model, row, 200_000, 1)
+    law = shortest_law(recording_of(stream(truth, 800_000, 1)), model, row, 1)
     for units in (15, 31):  # of the clock: 1 and 2 ns
         end = (units + 0.5) * law.unit
         number = int((law.recorded <= end).sum())
@@ -513,7 +513,7 @@ def test_a_pulse_that_is_nearly_always_recorded_has_no_upper_end() -> None:
     truth = replace(BASE, signal=40.0, sigma=0.03, jitter=0.3, unit=0.016)
     signal = ml.calibrate(stream(truth, 30_000, 2), seed=2).estimates["signal"]
     assert np.isnan(signal.error)
-    assert 4.0 < signal.low < 40.0
+    assert 0.0 <= signal.low < 40.0
     assert np.isinf(signal.high)
     assert "nearly every pulse" in signal.note
 

@@ -27,7 +27,7 @@ _WIDER = 4.0  # standard errors of the logarithm of a mean delay, by a normal la
 _DOUBTFUL = 0.01  # p-value below which a fit is tested again
 _STREAMS = 64  # by so many streams
 _RETESTED = 1e8  # of so many photons at most
-_CUMULATED = 100.0  # intervals expected up to an edge, for a normal law of their number
+_CUMULATED = 100.0  # registrations expected of a light, or intervals up to an edge, for a normal law of their number
 
 
 @dataclass(frozen=True)
@@ -131,13 +131,15 @@ class Batch(NamedTuple):
     def one_count(self, model: Model, free: Index) -> FloatArray:
         """Covariance (free, free) that one registration more or less adds to background and signals.
 
-        It is the inverse square of the sum of the positive slopes of phases or intervals; without it an amount of no
-        counts has no error. Only the intervals of a saturated detector depend on its light.
+        It is the inverse square of the sum of the positive slopes of phases; without it an amount of no counts has no
+        error. It is left out where light has over `_CUMULATED` registrations by the intervals: of a saturated detector
+        only these depend on its light.
         """
         positive, phases = np.maximum(self.slope[:, free], 0.0), self.cells.phases
-        rise = np.maximum(positive[:phases].sum(0), positive[phases : phases + self.cells.gap_edges.size + 1].sum(0))
+        gaps = positive[phases : phases + self.cells.gap_edges.size + 1].sum(0)
         amount = (free == 0) | ((free < model.light) & (free % 2 == 1))
-        return np.diag(amount / np.maximum(rise, 1.0 / model.scale(self.centre)[free]) ** 2)
+        few = amount & (self.centre[free] * gaps < _CUMULATED)
+        return np.diag(few / np.maximum(positive[:phases].sum(0), 1.0 / model.scale(self.centre)[free]) ** 2)
 
     def estimator(self, free: Index, prior: FloatArray | float = 0.0) -> FloatArray:
         """G (free, c), with an optional prior precision (free, free)."""
@@ -482,7 +484,8 @@ class Fit:
         others, varied = free[(free < late - 1) | (free > late)], free != late
         photons, settings = float(self.recording.photons), self.effort.settings
         reach = _WIDER * float(np.linalg.norm(root[~varied]))
-        least, most = (float(model.bounded(np.full(model.size, theta[late] + end))[late]) for end in (-reach, reach))
+        place = float(model.bounded(theta)[late])
+        least, most = (float(model.bounded(np.full(model.size, place + end))[late]) for end in (-reach, reach))
         wide = _NEAR * root_of((root @ root.T)[np.ix_(varied, varied)])
         cycles = max(2, round(self.exposure(self.effort.of(photons, self.effort.longer))))
         ratio = self.exposure(photons) / cycles

@@ -306,9 +306,13 @@ class Fit:
         """Laser periods in which the recording has this many photons."""
         return self.recording.exposure * photons / self.recording.photons
 
+    def cycles(self, photons: float) -> int:
+        """Whole laser periods, at least two, in which the recording has about this many photons."""
+        return max(2, round(self.exposure(photons)))
+
     def streams(self, model: Model, theta: FloatArray, photons: float, number: int = LIGHTS) -> Recording:
         """Simulated streams of parameters `theta` (p,), each with this many photons of the recording."""
-        return model.streams(np.tile(theta, (number, 1)), max(2, round(self.exposure(photons))), self.next_seed())
+        return model.streams(np.tile(theta, (number, 1)), self.cycles(photons), self.next_seed())
 
     def cells(self, model: Model, theta: FloatArray, photons: float) -> Cells:
         """Cells of a law for this many photons, by streams at `theta`."""
@@ -322,7 +326,7 @@ class Fit:
         precision = np.linalg.inv(spread**2 * photons / size * root @ root.T) + linear
         wide = root_of(np.asarray(np.linalg.inv(precision), np.float64))
         rows = design(model, theta, wide, free, self.next_seed(), more * self.effort.settings)
-        cycles = max(2, round(self.exposure(size)))
+        cycles = self.cycles(size)
         ratio = self.exposure(photons) / cycles
         totals, correlation = counted(model, cells, rows, cycles, self.next_seed())
         y, x = totals * ratio, (rows - theta)[:, free]
@@ -454,7 +458,7 @@ class Fit:
         interval = None
         if not (model.effects or model.fields):
             early, shortest = self.shortest(model, draws(model, raw, cov, free))
-            dead, timed = shortest.dead_time(), free == model.light + 2
+            dead, timed = shortest.dead_time, free == model.light + 2
             error = float(np.sqrt(cov[timed, timed].sum()))
             if timed.any() and (early < 0.05 or shortest.decides(float(mean[model.light + 2]), error)):
                 at = mean.copy()
@@ -487,7 +491,7 @@ class Fit:
         place = float(model.bounded(theta)[late])
         least, most = (float(model.bounded(np.full(model.size, place + end))[late]) for end in (-reach, reach))
         wide = _NEAR * root_of((root @ root.T)[np.ix_(varied, varied)])
-        cycles = max(2, round(self.exposure(self.effort.of(photons, self.effort.longer))))
+        cycles = self.cycles(self.effort.of(photons, self.effort.longer))
         ratio = self.exposure(photons) / cycles
 
         def powers(delay: FloatArray) -> FloatArray:
@@ -537,7 +541,7 @@ class Fit:
         Counts that are not linear in the parameters scatter more in these than in the shorter streams of a linear law.
         """
         photons = float(self.recording.photons)
-        cycles = max(2, round(self.exposure(min(photons, _RETESTED / _STREAMS))))
+        cycles = self.cycles(min(photons, _RETESTED / _STREAMS))
         made = [law.cells.of(model.streams(row, cycles, self.next_seed())) for row in rows[:_STREAMS]]
         rest = (np.array(made) * (self.exposure(photons) / cycles) - offset) @ project.T
         mean = rest.mean(0)

@@ -85,15 +85,16 @@ def look_at(recording: Recording) -> Look:
     period = recording.period_ns if recording.laser else float("nan")
     smallest, quantiles = gaps[:20], np.quantile(gaps, (0.01, 0.5, 0.99))
     same, own, unit, locked = int((gaps == 0.0).sum()), other_period(recording), clock.unit_ns, clock.locked
-    numbers = n, cycles, period, seconds, unit, locked, n / seconds, smallest, quantiles, same
-    return Look(*numbers, own, longest_dark(recording))
+    dark = longest_dark(recording)
+    return Look(n, cycles, period, seconds, unit, locked, n / seconds, smallest, quantiles, same, own, dark)
 
 
 def longest_dark(recording: Recording) -> tuple[float, float] | None:
     """Beginning and length, s, of the longest time without a photon, if it is improbable in constant light; else None.
 
-    The n times of constant light divide a recording T into intervals of which one exceeds x with a probability of at
-    most (n + 1) (1 - x / T)^n, or with n - 2 where it begins and ends at a photon. Counts of a detector are more even.
+    The n times of constant light divide a recording of length T into intervals, of which one exceeds x with a
+    probability of at most (n + 1) (1 - x / T)^n. The power is n - 2 here, since a recording may begin and end at a
+    photon. Dead time makes such intervals rarer still.
     """
     start, longest = 0.0, (0.0, 0.0)
     for piece, cycles in zip(recording.pieces, recording.cycles, strict=True):

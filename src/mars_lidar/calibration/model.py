@@ -248,7 +248,7 @@ class Model:
         signal, delay = (rows[:, first : self.light : 2].T[:, None] for first in (1, 2))
         return Flux(signal, back, delay % self.clock.period_ns)
 
-    def streams(self, rows: FloatArray, cycles: int, seed: int, jitter: bool = True) -> Recording:
+    def streams(self, rows: FloatArray, cycles: int, seed: int) -> Recording:
         """A stream of `cycles` periods for each row of (rows, p), all with the detector of the first but its jitter.
 
         The jitter is added here, a normal deviate for each time, so that it may differ from row to row and no table is
@@ -262,7 +262,7 @@ class Model:
         task = Task(flux, system, 1, 0, np.arange(len(rows), dtype=np.uint32), seed, threads=1, progress=None)
         most = self.clock.period_ns / max(system.detector.dead_time_ns, 1e-9)  # registrations in a period
         made = ExactEngine().records(task, float(cycles * np.minimum(flux.total, most).sum()))
-        sigma = self.widths(rows)[1] * jitter
+        sigma = self.widths(rows)[1]
         sigma[sigma <= _NARROWEST * self.clock.period_ns] = 0.0
         times, drawn = np.empty(made.phase.size), (made.cycle, made.phase, made.offsets)
         _core.recorded_times(*drawn, sigma_ns=sigma, seed=seed, grid=self.clock, out=times)

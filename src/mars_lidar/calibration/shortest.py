@@ -54,6 +54,7 @@ class Shortest:
         )
         return float(min(1.0, 2.0 * min(least, 1.0 - more)))
 
+    @cached_property
     def dead_time(self) -> tuple[float, float, float]:
         """Median of the dead time given the shortest interval, for a flat prior, and its 95 % interval.
 
@@ -71,7 +72,7 @@ class Shortest:
 
         Their 95 % interval is over twice as wide as this one, or less than half as wide as all short intervals allow.
         """
-        _, low, high = self.dead_time()
+        _, low, high = self.dead_time
         return 3.92 * error > 2.0 * (high - low) or 3.92 * error < 0.5 * self.narrowest(dead)
 
     def narrowest(self, dead: float, cells: int = 12) -> float:

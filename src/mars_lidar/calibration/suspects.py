@@ -306,7 +306,7 @@ def _flicker(fit: Fit, fitted: Fitted, counts: float = 8.0, windows: int = 64) -
     from scipy.special import ndtr
 
     recording, size = fit.recording, min(float(fit.recording.photons), fit.effort.batch / 4.0)
-    cycles = max(2, round(fit.exposure(size)))
+    cycles = fit.cycles(size)
     rows = draws(fitted.model, fitted.unbounded, fitted.covariance, fitted.free)[:LIGHTS]
     drawn = [Recording((t,), (cycles,), recording.clock) for t in fitted.model.streams(rows, cycles, 0)]
     sizes = counts * 4.0 ** np.arange(16)

@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy.special import ndtr
 
-from mars_lidar.calibration.recording import Clock
-from mars_lidar.calibration.start import free_light
+from mars_lidar.calibration.recording import Clock, free_light
 from tests.calibration.photon_by_photon import Truth, photon_by_photon
 from tests.calibration.sweep import random_truth
 

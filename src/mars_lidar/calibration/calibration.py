@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from statistics import NormalDist
 from typing import Any, Literal
 
 import numpy as np
@@ -19,7 +20,15 @@ from mars_lidar.calibration.fit import Effort, Fit, Fitted, Guess, draws, smalle
 from mars_lidar.calibration.look import Look, look_at
 from mars_lidar.calibration.model import Model, Waveform, all_carriers
 from mars_lidar.calibration.realizations import Realizations, realizations
-from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording, recording_of, recording_of_arrivals
+from mars_lidar.calibration.recording import (
+    FALSE_ALARM,
+    LEAST_PHOTONS,
+    Recording,
+    brightest_window,
+    free_waveform,
+    recording_of,
+    recording_of_arrivals,
+)
 from mars_lidar.calibration.suspects import Drift, Score, Trial
 from mars_lidar.instrument.avalanches import Afterpulsing
 from mars_lidar.instrument.detector import Detector
@@ -388,7 +397,7 @@ def _model(recording: Recording, shape: Pulse | str, returns: int, fields: dict[
         if returns > 1:
             raise ValueError(f"returns must be 1 with pulse='free', whose light has any shape, got {returns}")
         fine = recording.photons >= Effort.bin_photons * Effort.light_bins
-        light = start.free_waveform(recording, Effort.light_bins if fine else Effort.shape_bins)
+        light = free_waveform(recording, Effort.light_bins if fine else Effort.shape_bins)
         return replace(model, waveform=Waveform(*light, recording.exposure, recording.period_ns, fine))
     return replace(model, returns=returns, pulse=pulse) if recording.laser else model
 
@@ -460,25 +469,27 @@ class _Run:
         recording, tried = self.described.recording, []
         for number in range(attempt, attempt + Effort.attempts):
             fit = Fit(recording, Effort(), (self.seed, number))
-            dark = number == 0 and self.model.returns > 0 and start.brightest_window(recording)[0] > FALSE_ALARM
-            fitted = self._attempt(fit, replace(self.model, returns=0, pulse=None) if dark else self.model)
-            good = fitted.converged, fitted.lit and not (dark and fitted.p_value < FALSE_ALARM)
+            dark = number == 0 and self.model.returns > 0 and brightest_window(recording)[0] > FALSE_ALARM
+            model = replace(self.model, returns=0, pulse=None) if dark else self.model
+            fitted = self._attempt(fit, model, start.starts(fit, model, self.fixed)[number - attempt :])
+            whole = fitted.lit and (fitted.bright > FALSE_ALARM or fitted.p_value < fitted.bright)
+            good = fitted.converged, whole and not (dark and fitted.p_value < FALSE_ALARM)
             tried.append((good, fit, fitted))
             if all(good):
                 break
         _, fit, fitted = max(tried, key=lambda each: each[0])
         return fit, fitted
 
-    def _attempt(self, fit: Fit, model: Model) -> Fitted:
-        """A fit with the simulated streams of `fit`."""
+    def _attempt(self, fit: Fit, model: Model, places: list[FloatArray]) -> Fitted:
+        """A fit with the simulated streams of `fit`, from the better of the first two places."""
         known = {*self.fixed} if model.gaussian else {*self.fixed, "width"}
         free = np.array([k for k, name in enumerate(model.names) if name not in known], np.intp)
-        first, photons = fit.effort.first, float(fit.recording.photons)
-        places = [theta for _, theta in start.starts(fit, model, self.fixed)]
+        photons = float(fit.recording.photons)
+        first = min(fit.effort.first, photons)
         guesses = [Guess(model, theta, np.diag(0.5 * model.scale(theta)[free]), free) for theta in places[:2]]
-        tried = [fit.steps(guesses[0], min(photons, first))]
+        tried = [fit.steps(guesses[0], first)]
         with suppress(ValueError):  # steps from the second best place may lead to no photons
-            tried.append(fit.steps(guesses[1], min(photons, first)))
+            tried.append(fit.steps(guesses[1], first))
         early, _, settled = min(tried, key=lambda trial: trial[1])
         guess, error = early, np.linalg.norm(early.root, axis=1)
         if first < photons:
@@ -503,7 +514,7 @@ class _Run:
         centre = model.bounded(fitted.theta)
         estimates = _estimates(fitted, drift) if fitted.converged else {}
         if estimates and self.model.returns and model.returns < 2 and not (model.returns and fitted.lit):
-            _, most = start.brightest_window(recording)
+            _, most = brightest_window(recording)
             signal = min(float(fitted.theta[1]), most) if model.returns else 0.0
             words = "no significant pulse: upper limit of one anywhere"
             estimates["signal"] = Estimate(signal, np.nan, 0.0, most, words)
@@ -526,7 +537,7 @@ class _Run:
             lows, highs = zip(*ranges, strict=True)
             estimates[name] = replace(own, least=min(lows), most=max(highs))
         cycles, known = int(np.clip(recording.exposure, 1, TOL.cycles)), fitted.converged and recording.laser
-        light = start.free_waveform(recording, Effort.shape_bins) if model.waveform else None
+        light = free_waveform(recording, Effort.shape_bins) if model.waveform else None
         wave, error = (float(centre[0] / light[0].sum()) * part for part in light) if light else (None, None)
         return replace(
             self.described,
@@ -558,10 +569,12 @@ def _changes(drift: Drift) -> list[Suspect]:
 
 def _worst_cells(fitted: Fitted) -> Suspect:
     """The group of cells that fits worst."""
-    cells = fitted.batch.cells
-    groups = np.split(np.arange(cells.size), [cells.phases, cells.phases + cells.gap_edges.size + 1])
     words = ("phases: shape of the light", "intervals", "intervals by phase")
     advice = ("pulse='free', or returns=2", *["no option of the model"] * 2)
+    if fitted.bright < FALSE_ALARM:
+        return Suspect(words[0], -NormalDist().inv_cdf(fitted.bright + 1e-16), option=advice[0])
+    cells = fitted.batch.cells
+    groups = np.split(np.arange(cells.size), [cells.phases, cells.phases + cells.gap_edges.size + 1])
     worst = Suspect("", -np.inf, option=advice[-1])
     for name, option, group in zip(words, advice, groups, strict=True):
         used = group[fitted.offset[group] > 5.0]

@@ -17,7 +17,7 @@ import numpy as np
 from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.calibration.cells import Cells
 from mars_lidar.calibration.model import Model
-from mars_lidar.calibration.recording import FALSE_ALARM, Recording
+from mars_lidar.calibration.recording import FALSE_ALARM, Recording, brightest_window
 from mars_lidar.calibration.shortest import Shortest, shortest_law
 
 Index: TypeAlias = NDArray[np.intp]
@@ -235,6 +235,7 @@ class Fitted:
     fresh: FloatArray  # (streams, c) residual counts of these streams, of mean 0
     misfit_z: float  # standard deviations of the misfit above that of fresh streams
     p_value: float
+    bright: float  # probability of a window of the phases as much brighter than the fitted light
     converged: bool
     by_shortest: tuple[float, float, float] | None  # the dead time and its interval, if the counts do not determine it
 
@@ -455,6 +456,12 @@ class Fit:
         z, p = _misfit(rest, fresh, law, near.offset, near.ratio / len(near.counts))
         if p < _DOUBTFUL and effort.more > 1:
             p = self._tested_again(model, draws(model, raw, cov, free), law, near.offset, unbound, recorded)
+        bright = 1.0  # cells resolve the fitted pulse alone
+        if effort.more > 1 and model.returns:
+            cycles = self.cycles(min(effort.share * photons, effort.batch) / LIGHTS)
+            made = model.streams(draws(model, raw, cov, free)[:LIGHTS], cycles, self.next_seed())
+            bright = min(1.0, brightest_window(self.recording, made)[0])
+            p = min(p, bright) if bright < FALSE_ALARM else p
         interval = None
         if not (model.effects or model.fields):
             early, shortest = self.shortest(model, draws(model, raw, cov, free))
@@ -471,8 +478,8 @@ class Fit:
                 interval, mean[model.light + 2] = dead, dead[0]
             elif early < FALSE_ALARM:
                 p = min(p, early)
-        counts = estimator, jacobian, rest, departure, fresh
-        return Fitted(model, free, mean, cov, raw, law, near.offset, *counts, z, p, bool(size.max() < _NEAR), interval)
+        counts, converged = (estimator, jacobian, rest, departure, fresh), bool(size.max() < _NEAR)
+        return Fitted(model, free, mean, cov, raw, law, near.offset, *counts, z, p, bright, converged, interval)
 
     def _over_delays(
         self, guess: Guess, law: Batch, offset: FloatArray, recorded: FloatArray

@@ -204,13 +204,16 @@ class Model:
         """Changes (p,) of the parameters over which the counts are about linear, for the spread of a batch."""
         k, unit = self.light, self.clock.unit_ns
         width = float(np.hypot(theta[k], unit / 12**0.5))
+        # the next photon is waited for so long, at the brightest phase
+        wait = 1.0 / (theta[0] / self.clock.period_ns + float((theta[1:k:2] / (2.5 * width)).max(initial=0.0)))
+        short = min(width, wait)
         out = np.zeros(self.size)
         out[0] = max(0.3 * theta[0], 0.02 * float(theta[1:k:2].sum()))
         out[1:k:2] = 0.2 * theta[1:k:2] + 0.04 * theta[0]
         out[2:k:2] = 0.6 * width
         out[k] = 0.3 * width
-        out[k + 1] = 0.6 * (1.0 if self.split else width)
-        out[k + 2] = 0.6 * width + unit
+        out[k + 1] = 0.6 * short / (width if self.split else 1.0)
+        out[k + 2] = 0.6 * short + unit
         out[k + 3 :] = 0.8
         for effect in self.effects:
             at = self.names.index(effect.names[0])

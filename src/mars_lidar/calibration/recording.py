@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -101,6 +101,71 @@ class Recording:
             edges = np.searchsorted(piece, np.arange(1, count) * (cycles / count * self.period_ns))
             parts += [Recording((t,), (cycles / count,), self.clock, self.laser) for t in np.split(piece, edges)]
         return parts
+
+
+def free_light(t: FloatArray, clock: Clock, hold: float, bins: int) -> tuple[FloatArray, FloatArray]:
+    """Registrations and armed passes (bins,) over the period, counted from `hold` after each registration on.
+
+    Their ratio is the probability of a photon in a bin, for any shape of light and any dead time below `hold`. Times
+    are spread over the unit of the clock, because bins contain different numbers of its ticks, or end at one.
+    """
+    period = clock.period_ns
+    t = t + clock.unit_ns * (np.random.default_rng(0).random(t.size) - 0.5)
+    a = np.floor((t[:-1] + hold) * (bins / period)).astype(np.int64)
+    b = np.floor(t[1:] * (bins / period)).astype(np.int64)
+    late = b > a
+    a, b = a[late], b[late]
+    begun, hits = (np.bincount(x % bins, minlength=bins) for x in (a, b))
+    # a bin is passed once in each whole period from a to b, and once more where it lies up to b % bins, not a % bins
+    passes = (b // bins - a // bins).sum() + np.cumsum((hits - begun)[::-1])[::-1]
+    return hits.astype(float), passes.astype(float)
+
+
+def free_waveform(recording: Recording, most: int) -> tuple[FloatArray, FloatArray]:
+    """Light (bins,) of any shape in photons per period and bin, without dead time, and its standard errors.
+
+    A bin records one photon a pass, with the probability 1 - exp(-light). Passes are counted from beyond the shortest
+    intervals on, where the pixel is certainly armed.
+    """
+    gaps, clock = recording.intervals, recording.clock
+    low, edge = gaps[1], gaps[max(30, gaps.size // 500)]
+    hold = float(edge + 3.0 * (edge - low) + 2.0 * clock.unit_ns)
+    # whole units of the clock in each bin, if possible; every number divides 0, where the period has no whole units
+    bins = max((n for n in range(most // 8, most + 1) if clock.units % n == 0), default=most)
+    hits, passes = np.sum([free_light(piece, clock, hold, bins) for piece in recording.pieces], axis=0)
+    passes = np.maximum(passes, 1.0)
+    share = np.clip(hits, 1e-3, passes - 0.5) / passes
+    return -np.log1p(-share), np.sqrt((hits + 1.0) / (1.0 - share)) / passes
+
+
+def brightest_window(recording: Recording, streams: Recording | None = None) -> tuple[float, float]:
+    """Probability that light has a window as much brighter than the rest, and 95 % upper limit of a further signal.
+
+    The light is constant, or that of simulated `streams`, whose scatter is part of the noise. The windows are up to a
+    quarter of the period wide. The limit is the largest of all of them, so that it holds for a pulse anywhere.
+    """
+    from scipy.special import ndtr
+
+    rate, error = free_waveform(recording, 512)
+    made = [] if streams is None else [replace(streams, pieces=(t,), cycles=streams.cycles[:1]) for t in streams]
+    drawn = np.array([free_waveform(each, rate.size)[0] for each in made] or [np.zeros(rate.size)])
+    ratio = recording.exposure / streams.cycles[0] if streams is not None else 0.0
+    best, limit = -np.inf, 0.0
+    widths = 2 ** np.arange(int(np.log2(rate.size / 4.0)) + 1)
+    for m in widths:
+        share = m / (rate.size - m)
+
+        def of(values: FloatArray, rest: float, m: int = m) -> FloatArray:
+            """Sums (..., bins) in windows, and those of all else times `rest`."""
+            inside = sum(np.roll(values, -k, axis=-1) for k in range(m))
+            return np.asarray(inside + rest * (values.sum(-1, keepdims=True) - inside))
+
+        excess, variance = of(rate - drawn.mean(0), -share), of(error**2, share**2)
+        between = of(drawn, -share).var(0, ddof=min(1, len(made)))
+        noise = np.sqrt(variance + np.maximum(between, ratio * variance) * (1.0 + 1.0 / len(drawn)))
+        most = np.where(noise > 1.0, np.inf, excess + 1.645 * noise)  # hardly a pass without a photon
+        best, limit = max(best, float((excess / noise).max())), max(limit, float(most.max()))
+    return float(widths.size * rate.size * ndtr(-best)), limit
 
 
 def recording_of(times: Timestamps | Sequence[Timestamps], *, pooled: bool = False) -> Recording:

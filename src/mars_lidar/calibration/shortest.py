@@ -13,6 +13,7 @@ their number is a Poisson number: none is recorded with the probability exp(-H).
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -112,10 +113,11 @@ def shortest_law(recording: Recording, model: Model, rows: FloatArray, seed: int
     flux = model.flux(rows, round(recording.exposure), seed)
     systems = [model.system(row, 2, jitter=False) for row in rows]
     middle, of = flux[:, len(rows) // 2 : len(rows) // 2 + 1], systems[len(rows) // 2]
-    try:
-        phases = registration_pdf(middle, of.replace(bins=2**14), "stationary")[0, 0]
-    except ConvergenceError:  # of a saturated detector, whose phases are even
-        phases = registration_pdf(middle, of.replace(bins=2**12), "stationary")[0, 0]
+    phases = np.full(2**12, 0.5**12)  # of a detector too saturated for the stationary law
+    for most in (2**14, 2**12):
+        with suppress(ConvergenceError):
+            phases = registration_pdf(middle, of.replace(bins=most), "stationary")[0, 0]
+            break
     bins = phases.size
     light = np.array([photons_per_bin(flux[:, k : k + 1], s, bins=bins)[0, 0] for k, s in enumerate(systems)])
     rate = np.fft.irfft(np.conj(np.fft.rfft(phases)) * np.fft.rfft(light), bins) * (recording.photons * bins / period)

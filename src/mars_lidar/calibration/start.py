@@ -7,25 +7,7 @@ import numpy as np
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibration.fit import Fit
 from mars_lidar.calibration.model import Model
-from mars_lidar.calibration.recording import Clock, Recording
-
-
-def free_light(t: FloatArray, clock: Clock, hold: float, bins: int) -> tuple[FloatArray, FloatArray]:
-    """Registrations and armed passes (bins,) over the period, counted from `hold` after each registration on.
-
-    Their ratio is the probability of a photon in a bin, for any shape of light and any dead time below `hold`. Times
-    are spread over the unit of the clock, because bins contain different numbers of its ticks, or end at one.
-    """
-    period = clock.period_ns
-    t = t + clock.unit_ns * (np.random.default_rng(0).random(t.size) - 0.5)
-    a = np.floor((t[:-1] + hold) * (bins / period)).astype(np.int64)
-    b = np.floor(t[1:] * (bins / period)).astype(np.int64)
-    late = b > a
-    a, b = a[late], b[late]
-    begun, hits = (np.bincount(x % bins, minlength=bins) for x in (a, b))
-    # a bin is passed once in each whole period from a to b, and once more where it lies up to b % bins, not a % bins
-    passes = (b // bins - a // bins).sum() + np.cumsum((hits - begun)[::-1])[::-1]
-    return hits.astype(float), passes.astype(float)
+from mars_lidar.calibration.recording import free_light, free_waveform
 
 
 def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
@@ -75,8 +57,8 @@ def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
     return np.array([max(faint * bins, 1e-5), *peaks, own**0.5])
 
 
-def starts(fit: Fit, model: Model, fixed: dict[str, float]) -> list[tuple[float, FloatArray]]:
-    """(misfit, parameters (p,)) for seven shares of jitter in the recorded width, sorted by the misfit."""
+def starts(fit: Fit, model: Model, fixed: dict[str, float]) -> list[FloatArray]:
+    """Parameters (p,) for seven shares of jitter in the recorded width, sorted by the misfit."""
     k, unit, recording = model.light, model.clock.unit_ns, fit.recording
     photons = min(recording.photons, fit.effort.first)
     observed, _ = _short_intervals(fit)
@@ -100,7 +82,7 @@ def starts(fit: Fit, model: Model, fixed: dict[str, float]) -> list[tuple[float,
         recorded = cells.of(recording) * (photons / recording.photons)
         r = (2 * np.sqrt(recorded + 0.375) - 2 * np.sqrt(rows + 0.375).mean(0)) ** 2
         trials.append((float(r.sum()), theta))
-    return sorted(trials, key=lambda pair: pair[0])
+    return [theta for _, theta in sorted(trials, key=lambda pair: pair[0])]
 
 
 def saturated(gaps: FloatArray, model: Model, theta: FloatArray, fixed: dict[str, float]) -> FloatArray:
@@ -140,41 +122,3 @@ def with_edge(fit: Fit, model: Model, theta: FloatArray) -> FloatArray:
         theta = theta.copy()
         theta[k + 2] = max(theta[k + 2] + float((observed - here)[1:-1].mean()), 0.05 * observed[0])
     return theta
-
-
-def free_waveform(recording: Recording, most: int) -> tuple[FloatArray, FloatArray]:
-    """Light (bins,) of any shape in photons per period and bin, without dead time, and its standard errors.
-
-    A bin records one photon a pass, with the probability 1 - exp(-light). Passes are counted from beyond the shortest
-    intervals on, where the pixel is certainly armed.
-    """
-    gaps, clock = recording.intervals, recording.clock
-    low, edge = gaps[1], gaps[max(30, gaps.size // 500)]
-    hold = float(edge + 3.0 * (edge - low) + 2.0 * clock.unit_ns)
-    # whole units of the clock in each bin, if possible; every number divides 0, where the period has no whole units
-    bins = max((n for n in range(most // 8, most + 1) if clock.units % n == 0), default=most)
-    hits, passes = np.sum([free_light(piece, clock, hold, bins) for piece in recording.pieces], axis=0)
-    passes = np.maximum(passes, 1.0)
-    share = np.clip(hits, 1e-3, passes - 0.5) / passes
-    return -np.log1p(-share), np.sqrt((hits + 1.0) / (1.0 - share)) / passes
-
-
-def brightest_window(recording: Recording) -> tuple[float, float]:
-    """Probability that constant light has a window as much brighter than the rest, and 95 % upper limit of a signal.
-
-    The windows are up to a quarter of the period wide. The limit is the largest of all of them, so that it holds for a
-    pulse anywhere.
-    """
-    from scipy.special import ndtr
-
-    rate, error = free_waveform(recording, 512)
-    best, limit = -np.inf, 0.0
-    widths = 2 ** np.arange(int(np.log2(rate.size / 4.0)) + 1)
-    for m in widths:
-        share = m / (rate.size - m)
-        inside, variance = (sum(np.roll(part, -k) for k in range(m)) for part in (rate, error**2))
-        excess = inside - share * (rate.sum() - inside)
-        noise = np.sqrt(variance + share**2 * ((error**2).sum() - variance))
-        most = np.where(noise > 1.0, np.inf, excess + 1.645 * noise)  # hardly a pass without a photon
-        best, limit = max(best, float((excess / noise).max())), max(limit, float(most.max()))
-    return float(widths.size * rate.size * ndtr(-best)), limit

@@ -3,8 +3,8 @@
 Given the registrations before, those of a bin are binomial in the passes in which it was armed (R9), at the most likely
 light of each pixel. The law of a parameter, for a flat prior, is the share of the likelihood in cells, of which likely
 ones are divided until none holds much: of the dead time at the most likely width for each, and of the width at typical
-dead times. Value, error and interval are its median, root mean square and quantiles. A cube simulated at the estimates
-is estimated, too: what the likelihood of bins, in which light and armed passes count as even, does to it is an error.
+dead times. Value, error and interval are its median, root mean square and quantiles. What the
+likelihood of bins, in which light and armed passes count as even, does to simulated cubes is an error as well.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from mars_lidar.reconstruction.histograms import Histograms, checked
 from mars_lidar.reconstruction.maximum_likelihood import MaximumLikelihood
 from mars_lidar.reconstruction.method import Estimates
 
+_SIMULATED = 24  # cubes, whose estimates have known errors
 _LARGEST_SHARE = 0.05  # of the probability that a cell of a parameter may hold, if it can be divided
 
 
@@ -141,40 +142,34 @@ def calibrate_cube(
     middles = 0.5 * (edges[1:] + edges[:-1])
     first = np.array([at_best_width(dead, sigmas, some[:8]) for dead in middles])
     likely = np.sort(np.argsort(first[:, 0])[-40:])
+    widths = dict(zip(middles[likely], first[likely, 1], strict=True))
 
-    def estimated(counts: FloatArray, nearest: float) -> tuple[Estimate, Estimate]:
-        """Dead time and width; of several likely dead times the one nearest to a given one."""
-        widths = dict(zip(middles[likely], first[likely, 1], strict=True))
+    def value(dead: float) -> float:
+        near = widths[min(widths, key=lambda other: abs(other - dead))]
+        log, widths[dead] = at_best_width(dead, near * np.array([0.65, 1.0, 1.5]), some)
+        return log
 
-        def value(dead: float) -> float:
-            near = widths[min(widths, key=lambda other: abs(other - dead))]
-            log, widths[dead] = at_best_width(dead, near * np.array([0.65, 1.0, 1.5]), counts)
-            return log
+    deads, share = _law(value, edges[likely], edges[likely + 1])
+    # another maximum, a period away, is part of the error: a mean between the two would be neither; of several the
+    # value is the one nearest to the given dead time
+    mode = np.rint((deads - deads[share.argmax()]) / system.period_ns)
+    modes = [mode == k for k in np.unique(mode) if share[mode == k].sum() >= 0.05]
+    hold, hold_width = _estimate(deads, share, min(modes, key=lambda near: np.abs(deads[near] - given_dead).min()))
+    # the law of the width is the mean of those at typical dead times; its value is that at the estimated one
+    typical = deads[np.searchsorted(np.cumsum(share), np.arange(1, 12, 2) / 12.0)]
 
-        deads, share = _law(value, edges[likely], edges[likely + 1])
-        # another maximum, a period away, is part of the error: a mean between the two would be neither
-        mode = np.rint((deads - deads[share.argmax()]) / system.period_ns)
-        modes = [mode == k for k in np.unique(mode) if share[mode == k].sum() >= 0.05]
-        hold = _estimate(deads, share, min(modes, key=lambda near: np.abs(deads[near] - nearest).min()))
-        # the law of the width is the mean of those at typical dead times; its value is that at the estimated one
-        typical = deads[np.searchsorted(np.cumsum(share), np.arange(1, 12, 2) / 12.0)]
+    def width_law(dead: float) -> tuple[FloatArray, FloatArray]:
+        at = np.append(0.0, sigmas[:-1])
+        return _law(lambda sigma: _log_likelihood(some, trial(dead, sigma)), at[:-1], at[1:])
 
-        def width_law(dead: float) -> tuple[FloatArray, FloatArray]:
-            at = np.append(0.0, sigmas[:-1])
-            return _law(lambda sigma: _log_likelihood(counts, trial(dead, sigma)), at[:-1], at[1:])
-
-        laws = [width_law(dead) for dead in (hold.value, *typical)]
-        places, share = np.concatenate(laws, axis=1)
-        return hold, _estimate(places, share, np.arange(places.size) < laws[0][0].size)
-
-    hold, sigma = estimated(some, given_dead)
-    # the likelihood takes light and armed passes as even within a bin: what that does to a simulated cube is an error
+    laws = [width_law(dead) for dead in (hold.value, *typical)]
+    places, share = np.concatenate(laws, axis=1)
+    sigma, sigma_width = _estimate(places, share, np.arange(places.size) < laws[0][0].size)
     final, response_error = trial(hold.value, sigma.value), None
     light = MaximumLikelihood().estimate(Histograms(some, final, 1))
-    drawn = np.ascontiguousarray(simulate(_flux(light, final), final)[0, 0], some.dtype)
-    again = estimated(drawn, hold.value)
-    off = [abs(each.value - own.value) for each, own in zip(again, (hold, sigma), strict=True)]
-    estimates = {"dead_time_ns": _widened(hold, off[0]), "pulse_sigma_ns": _widened(sigma, off[1])}
+    off = _errors(trial, _flux(light, final), (hold.value, sigma.value), (hold_width, sigma_width))
+    hold, sigma = _widened(hold, hold_width, off[0]), _widened(sigma, sigma_width, off[1])
+    estimates = {"dead_time_ns": hold, "pulse_sigma_ns": sigma}
     if pulse == "free":
 
         def with_response(dead: float) -> tuple[System, FloatArray]:
@@ -183,7 +178,7 @@ def calibrate_cube(
         # a dead time just below a period looks like the tail of a pulse, so that each is tried with its own response
         edges = np.unique(np.clip(hold.value + system.period_ns * np.linspace(-1.05, 1.05, 22), 0.0, most))
         deads, share = _law(lambda dead: _log_likelihood(some, with_response(dead)[0]), edges[:-1], edges[1:])
-        estimates = {"dead_time_ns": _widened(_estimate(deads, share, share >= 0.0), off[0])}
+        estimates = {"dead_time_ns": _widened(_estimate(deads, share, share >= 0.0)[0], hold_width, off[0])}
         final, response_error = with_response(estimates["dead_time_ns"].value)
         light = MaximumLikelihood().estimate(Histograms(some, final, 1))
     p_values = np.asarray(light.p_value)
@@ -207,10 +202,46 @@ def _flux(light: Estimates, system: System) -> Flux:
     return Flux(light.signal[None], np.maximum(light.background, 0.0)[None], light.delay[None] * system.period_ns)
 
 
-def _widened(own: Estimate, off: float) -> Estimate:
-    """An estimate whose interval has twice the difference of a simulated cube; its error, too, if beyond two errors."""
-    error = off if off > 2.0 * own.error else own.error
-    return replace(own, error=error, low=min(own.low, own.value - 2.0 * off), high=max(own.high, own.value + 2.0 * off))
+def _errors(
+    trial: Callable[[float, float], System], flux: Flux, at: tuple[float, float], widths: tuple[float, float]
+) -> tuple[FloatArray, FloatArray]:
+    """Errors (cubes,) of the dead time and of the pulse's width of simulated cubes, ns, of systems near the estimates.
+
+    The likelihood takes light and armed passes as even within a bin, so that where a dead time ends in a pulse several
+    true ones have about the same estimate. So true ones lie three bins, or three `widths` of its law, on either side of
+    the estimate, and errors are those of the cubes whose estimates are a third as near.
+    """
+    (dead, sigma), bin_ns = at, trial(*at).bin_ns
+    reach = 3.0 * max(bin_ns, widths[0])
+    edges = np.unique(np.maximum(dead + reach * np.linspace(-1.5, 1.5, 13), 0.0))
+    off, logs = [], []
+    for k, true in enumerate(np.maximum(dead + reach * np.linspace(-1.0, 1.0, _SIMULATED), 0.0)):
+        counts = np.ascontiguousarray(simulate(flux, trial(float(true), sigma), seed=k)[0, 0])
+
+        def log(dead: float, sigma: float = sigma, counts: Any = counts) -> float:
+            return _log_likelihood(counts, trial(dead, sigma))
+
+        places, share = _law(log, edges[:-1], edges[1:])
+        estimate = _estimate(places, share, share >= 0.0)[0].value
+        if abs(estimate - dead) < reach / 3.0:
+            off.append(estimate - true)
+            logs.append([log(estimate, sigma + step * widths[1]) for step in (-1.0, 0.0, 1.0)])
+    if not off:
+        return np.array([reach]), np.array([widths[1]])
+    below, middle, above = np.array(logs).T
+    bend = max(float(np.mean(2.0 * middle - below - above)), 0.25)  # 1 of a normal law
+    return np.array(off), widths[1] * 0.5 * (above - below) / bend
+
+
+def _widened(own: Estimate, width: float, off: FloatArray) -> Estimate:
+    """An estimate with at least the root mean square of the errors `off`, and the largest within its interval.
+
+    `width`: standard deviation of the law of the nearest maximum; the interval ends at another one may be as far off.
+    """
+    largest, spread = float(np.abs(off).max()), float((off**2).mean() ** 0.5)
+    grown = max(largest - 1.96 * width, 0.0)
+    low, high = min(own.low - grown, own.value - largest), max(own.high + grown, own.value + largest)
+    return replace(own, error=max(own.error, spread), low=low, high=high)
 
 
 def _of_pixel(light: Estimates, name: str, k: int, unit: float = 1.0) -> Estimate:
@@ -296,13 +327,15 @@ def _law(value: Callable[[float], float], low: FloatArray, high: FloatArray) -> 
         log, places, size = (each[np.argsort(places)] for each in (log, places, size))
 
 
-def _estimate(places: FloatArray, share: FloatArray, near: BoolArray) -> Estimate:
-    """Median of the places `near`, root mean square of all about it, and 95 % interval of all."""
+def _estimate(places: FloatArray, share: FloatArray, near: BoolArray) -> tuple[Estimate, float]:
+    """Median of the places `near`, root mean square of all about it, and 95 % interval of all; that of those near."""
     order = np.argsort(places)
     places, share, near = places[order], share[order] / share.sum(), near[order]
     value = float(np.interp(0.5 * share[near].sum(), np.cumsum(share * near) - 0.5 * share * near, places))
     low, high = np.interp([0.025, 0.975], np.cumsum(share) - 0.5 * share, places)
-    return Estimate(value, float(share @ (places - value) ** 2) ** 0.5, float(low), float(high))
+    square = share * (places - value) ** 2
+    local = float(square[near].sum() / share[near].sum()) ** 0.5
+    return Estimate(value, float(square.sum()) ** 0.5, float(low), float(high)), local
 
 
 def _log_likelihood(counts: FloatArray, system: System) -> float:

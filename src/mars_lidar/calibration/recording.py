@@ -151,7 +151,7 @@ def brightest_window(recording: Recording, streams: Recording | None = None) -> 
     drawn = np.array([free_waveform(each, rate.size)[0] for each in made] or [np.zeros(rate.size)])
     ratio = recording.exposure / streams.cycles[0] if streams is not None else 0.0
     best, limit = -np.inf, 0.0
-    widths = 2 ** np.arange(int(np.log2(rate.size / 4.0)) + 1)
+    widths = [2**k for k in range(int(np.log2(rate.size / 4.0)) + 1)]
     for m in widths:
         share = m / (rate.size - m)
 
@@ -165,7 +165,7 @@ def brightest_window(recording: Recording, streams: Recording | None = None) -> 
         noise = np.sqrt(variance + np.maximum(between, ratio * variance) * (1.0 + 1.0 / len(drawn)))
         most = np.where(noise > 1.0, np.inf, excess + 1.645 * noise)  # hardly a pass without a photon
         best, limit = max(best, float((excess / noise).max())), max(limit, float(most.max()))
-    return float(widths.size * rate.size * ndtr(-best)), limit
+    return float(len(widths) * rate.size * ndtr(-best)), limit
 
 
 def recording_of(times: Timestamps | Sequence[Timestamps], *, pooled: bool = False) -> Recording:

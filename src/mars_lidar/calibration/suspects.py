@@ -203,7 +203,8 @@ def refitted(scores: Scores, trials: list[Trial]) -> tuple[Fitted, list[tuple[Sc
 
     Beside the fit with an effect stand the effect's larger score and its gain.
 
-    An effect is significant if its refit fits where the model is rejected; or if the refit is not worse and the
+    An effect is significant if its refit fits where the model is rejected, with a p-value 500 times as large (that of a
+    model rejected by chance, or beside a poor fit, grows less); or if the refit is not worse and the
     residual counts have a significant score, along the change by a small effect or along that by the effect of the
     refit. (The first alone misleads: a slow recovery has the score of a paralyzable detector, and an effect that the
     dead time has absorbed has none.) Of light of free shape, which follows the recorded phases, only the misfit counts.
@@ -229,7 +230,7 @@ def refitted(scores: Scores, trials: list[Trial]) -> tuple[Fitted, list[tuple[Sc
 
     def significant(final: Fitted, score: Score) -> bool:
         clear = score.z > limit and final.model.waveform is None
-        return clear or fitted.p_value < FALSE_ALARM < final.p_value
+        return clear or fitted.p_value < FALSE_ALARM * final.p_value and final.p_value > FALSE_ALARM
 
     chosen = min((each for each in refits if significant(*each[1:])), key=lambda each: each[1].misfit_z, default=None)
     if chosen is None:

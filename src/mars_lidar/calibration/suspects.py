@@ -230,7 +230,7 @@ def refitted(scores: Scores, trials: list[Trial]) -> tuple[Fitted, list[tuple[Sc
 
     def significant(final: Fitted, score: Score) -> bool:
         clear = score.z > limit and final.model.waveform is None
-        return clear or fitted.p_value < FALSE_ALARM * final.p_value and final.p_value > FALSE_ALARM
+        return clear or (fitted.p_value < FALSE_ALARM * final.p_value and final.p_value > FALSE_ALARM)
 
     chosen = min((each for each in refits if significant(*each[1:])), key=lambda each: each[1].misfit_z, default=None)
     if chosen is None:

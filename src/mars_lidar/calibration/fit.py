@@ -17,7 +17,7 @@ import numpy as np
 from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.calibration.cells import Cells
 from mars_lidar.calibration.model import Model
-from mars_lidar.calibration.recording import FALSE_ALARM, Recording, brightest_window
+from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording, brightest_window
 from mars_lidar.calibration.shortest import Shortest, shortest_law
 
 Index: TypeAlias = NDArray[np.intp]
@@ -458,7 +458,7 @@ class Fit:
             p = self._tested_again(model, draws(model, raw, cov, free), law, near.offset, unbound, recorded)
         bright = 1.0  # cells resolve the fitted pulse alone
         if effort.more > 1 and model.returns:
-            cycles = self.cycles(min(effort.share * photons, effort.batch) / LIGHTS)
+            cycles = self.cycles(max(LEAST_PHOTONS, min(effort.share * photons, effort.batch) / LIGHTS))
             made = model.streams(draws(model, raw, cov, free)[:LIGHTS], cycles, self.next_seed())
             bright = min(1.0, brightest_window(self.recording, made)[0])
             p = min(p, bright) if bright < FALSE_ALARM else p

@@ -204,7 +204,7 @@ class Model:
         """Changes (p,) of the parameters over which the counts are about linear, for the spread of a batch."""
         k, unit = self.light, self.clock.unit_ns
         width = float(np.hypot(theta[k], unit / 12**0.5))
-        # the next photon is waited for so long, at the brightest phase
+        # mean wait for the next photon at the brightest phase: a pulse's rate is that of its light within 2.5 widths
         wait = 1.0 / (theta[0] / self.clock.period_ns + float((theta[1:k:2] / (2.5 * width)).max(initial=0.0)))
         short = min(width, wait)
         out = np.zeros(self.size)

@@ -128,7 +128,7 @@ def free_waveform(recording: Recording, most: int) -> tuple[FloatArray, FloatArr
     intervals on, where the pixel is certainly armed.
     """
     gaps, clock = recording.intervals, recording.clock
-    low, edge = gaps[1], gaps[max(30, gaps.size // 500)]
+    low, edge = gaps[np.minimum([1, max(30, gaps.size // 500)], gaps.size - 1)]
     hold = float(edge + 3.0 * (edge - low) + 2.0 * clock.unit_ns)
     # whole units of the clock in each bin, if possible; every number divides 0, where the period has no whole units
     bins = max((n for n in range(most // 8, most + 1) if clock.units % n == 0), default=most)

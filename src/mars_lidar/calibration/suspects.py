@@ -209,8 +209,8 @@ def refitted(scores: Scores, trials: list[Trial]) -> tuple[Fitted, list[tuple[Sc
     refit. (The first alone misleads: a slow recovery has the score of a paralyzable detector, and an effect that the
     dead time has absorbed has none.) Of light of free shape, which follows the recorded phases, only the misfit counts.
     Where the refit with the least misfit is by short batches, it is repeated by full ones. The fit without the effect
-    is repeated, too, from the same place and with other streams: where that fits (p > 5 %), the mean of the scores
-    beside both must be significant, since a score has noise of the fit that it stands beside.
+    is repeated, too, from the same place and with other streams: the mean of the scores beside both must be
+    significant, or both rejected, since a score has noise of the fit that it stands beside.
     """
     fit, fitted = scores.fit, scores.fitted
     size = fitted.model.size
@@ -228,30 +228,30 @@ def refitted(scores: Scores, trials: list[Trial]) -> tuple[Fitted, list[tuple[Sc
             tested += [own] if own.noise < 1.0 else []
     limit = scores.limit(tested)
 
-    def significant(final: Fitted, score: Score) -> bool:
-        clear = score.z > limit and final.model.waveform is None
-        return clear or (fitted.p_value < FALSE_ALARM * final.p_value and final.p_value > FALSE_ALARM)
+    def significant(final: Fitted, z: float, p_value: float = fitted.p_value) -> bool:
+        clear = z > limit and final.model.waveform is None
+        return clear or (p_value < FALSE_ALARM * final.p_value and final.p_value > FALSE_ALARM)
 
-    chosen = min((each for each in refits if significant(*each[1:])), key=lambda each: each[1].misfit_z, default=None)
-    if chosen is None:
+    clear = [each for each in refits if significant(each[1], each[2].z)]
+    if not clear:
         return None
-    trial, final, score = chosen
+    trial, final, score = min(clear, key=lambda each: each[1].misfit_z)
     # the fit without the effect once more, from the place of the refit: the first one may have been bad
     if 0.5 * score.z < limit:
         known = final.free < size
         root = root_of(final.covariance[np.ix_(known, known)])
         other = fit.finish(Guess(fitted.model, final.theta[:size], root, final.free[known]), again=False)
-        if other.converged and other.p_value > 0.05:
+        if other.converged:
             small = np.r_[fitted.model.bounded(other.theta), trial.effect.start]
             again = Scores(fit, other).of(trial.effect, small if score is trial.score else final.theta)
-            if not 0.5 * (score.z + again.z) > limit:
+            if not significant(final, 0.5 * (score.z + again.z), max(fitted.p_value, other.p_value)):
                 return (other, []) if fitted.p_value < FALSE_ALARM else None
     if trial.direct is None:
         last = fit.finish(final.guess, finished=True)
         if last.converged:
             own = scores.of(trial.effect, last.theta)
             final, score = last, max(trial.score, own, key=lambda score: score.z)
-    if not (better(final) and significant(final, score)):
+    if not (better(final) and significant(final, score.z)):
         return None
     return final, [(score, fitted.misfit_z - final.misfit_z)]
 

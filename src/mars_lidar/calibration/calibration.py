@@ -472,8 +472,8 @@ class _Run:
             dark = number == 0 and self.model.returns > 0 and brightest_window(recording)[0] > FALSE_ALARM
             model = replace(self.model, returns=0, pulse=None) if dark else self.model
             fitted = self._attempt(fit, model, start.starts(fit, model, self.fixed)[number - attempt :])
-            whole = fitted.lit and (fitted.bright > FALSE_ALARM or fitted.p_value < fitted.bright)
-            good = fitted.converged, whole and not (dark and fitted.p_value < FALSE_ALARM)
+            pulses = fitted.lit and (fitted.window_p > FALSE_ALARM or fitted.p_value < fitted.window_p)
+            good = fitted.converged, pulses and not (dark and fitted.p_value < FALSE_ALARM)
             tried.append((good, fit, fitted))
             if all(good):
                 break
@@ -571,8 +571,8 @@ def _worst_cells(fitted: Fitted) -> Suspect:
     """The group of cells that fits worst."""
     words = ("phases: shape of the light", "intervals", "intervals by phase")
     advice = ("pulse='free', or returns=2", *["no option of the model"] * 2)
-    if fitted.bright < FALSE_ALARM:
-        return Suspect(words[0], -NormalDist().inv_cdf(fitted.bright + 1e-16), option=advice[0])
+    if fitted.window_p < FALSE_ALARM:
+        return Suspect(words[0], -NormalDist().inv_cdf(fitted.window_p + 1e-16), option=advice[0])
     cells = fitted.batch.cells
     groups = np.split(np.arange(cells.size), [cells.phases, cells.phases + cells.gap_edges.size + 1])
     worst = Suspect("", -np.inf, option=advice[-1])

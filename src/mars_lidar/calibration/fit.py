@@ -235,7 +235,7 @@ class Fitted:
     fresh: FloatArray  # (streams, c) residual counts of these streams, of mean 0
     misfit_z: float  # standard deviations of the misfit above that of fresh streams
     p_value: float
-    bright: float  # probability of a window of the phases as much brighter than the fitted light
+    window_p: float  # p-value of the brightest window of the phases, less the fitted light
     converged: bool
     by_shortest: tuple[float, float, float] | None  # the dead time and its interval, if the counts do not determine it
 
@@ -454,17 +454,18 @@ class Fit:
         fresh -= fresh.mean(0)
         rest = project @ (recorded - near.offset - jacobian[:, at_bound] @ (mean - near.centre)[free[at_bound]])
         z, p = _misfit(rest, fresh, law, near.offset, near.ratio / len(near.counts))
+        rows = draws(model, raw, cov, free)
         if p < _DOUBTFUL and effort.more > 1:
-            p = self._tested_again(model, draws(model, raw, cov, free), law, near.offset, unbound, recorded)
-        bright = 1.0  # cells resolve the fitted pulse alone
+            p = self._tested_again(model, rows, law, near.offset, unbound, recorded)
+        window_p = 1.0  # cells resolve the fitted pulse alone
         if effort.more > 1 and model.returns:
             cycles = self.cycles(max(LEAST_PHOTONS, min(effort.share * photons, effort.batch) / LIGHTS))
-            made = model.streams(draws(model, raw, cov, free)[:LIGHTS], cycles, self.next_seed())
-            bright = min(1.0, brightest_window(self.recording, made)[0])
-            p = min(p, bright) if bright < FALSE_ALARM else p
+            made = model.streams(rows[:LIGHTS], cycles, self.next_seed())
+            window_p = min(1.0, brightest_window(self.recording, made)[0])
+            p = min(p, window_p) if window_p < FALSE_ALARM else p
         interval = None
         if not (model.effects or model.fields):
-            early, shortest = self.shortest(model, draws(model, raw, cov, free))
+            early, shortest = self.shortest(model, rows)
             dead, timed = shortest.dead_time, free == model.light + 2
             error = float(np.sqrt(cov[timed, timed].sum()))
             if timed.any() and (early < 0.05 or shortest.decides(float(mean[model.light + 2]), error)):
@@ -479,7 +480,7 @@ class Fit:
             elif early < FALSE_ALARM:
                 p = min(p, early)
         counts, converged = (estimator, jacobian, rest, departure, fresh), bool(size.max() < _NEAR)
-        return Fitted(model, free, mean, cov, raw, law, near.offset, *counts, z, p, bright, converged, interval)
+        return Fitted(model, free, mean, cov, raw, law, near.offset, *counts, z, p, window_p, converged, interval)
 
     def _over_delays(
         self, guess: Guess, law: Batch, offset: FloatArray, recorded: FloatArray

@@ -92,6 +92,11 @@ class Recording:
             return 0.0, 0, 0.0
         return 0.5 * float((steps**2.0).mean()), steps.size, float(np.concatenate(counts).mean())
 
+    @property
+    def stretches(self) -> list[Recording]:
+        """Each stretch as a recording of its own."""
+        return [replace(self, pieces=(t,), cycles=(n,)) for t, n in zip(self.pieces, self.cycles, strict=True)]
+
     def parts(self, number: int) -> list[Recording]:
         """About `number` parts of equal exposure, in order of time."""
         size = self.exposure / number
@@ -147,7 +152,7 @@ def brightest_window(recording: Recording, streams: Recording | None = None) -> 
     from scipy.special import ndtr
 
     rate, error = free_waveform(recording, 512)
-    made = [] if streams is None else [replace(streams, pieces=(t,), cycles=streams.cycles[:1]) for t in streams]
+    made = [] if streams is None else streams.stretches
     drawn = np.array([free_waveform(each, rate.size)[0] for each in made] or [np.zeros(rate.size)])
     ratio = recording.exposure / streams.cycles[0] if streams is not None else 0.0
     best, limit = -np.inf, 0.0

@@ -13,7 +13,7 @@ from mars_lidar._base.cached import cached_property
 from mars_lidar._base.types import FloatArray, NDArray
 from mars_lidar.calibration.fit import LIGHTS, Fit, Fitted, Guess, draws, root_of
 from mars_lidar.calibration.model import Effect, Model, effects
-from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS, Recording
+from mars_lidar.calibration.recording import FALSE_ALARM, LEAST_PHOTONS
 from mars_lidar.calibration.start import with_edge
 
 # standard deviations that the largest of seven independent scores exceeds with the probability of a false alarm
@@ -232,10 +232,10 @@ def refitted(scores: Scores, trials: list[Trial]) -> tuple[Fitted, list[tuple[Sc
         clear = z > limit and final.model.waveform is None
         return clear or (p_value < FALSE_ALARM * final.p_value and final.p_value > FALSE_ALARM)
 
-    clear = [each for each in refits if significant(each[1], each[2].z)]
-    if not clear:
+    candidates = [each for each in refits if significant(each[1], each[2].z)]
+    if not candidates:
         return None
-    trial, final, score = min(clear, key=lambda each: each[1].misfit_z)
+    trial, final, score = min(candidates, key=lambda each: each[1].misfit_z)
     # the fit without the effect once more, from the place of the refit: the first one may have been bad
     if 0.5 * score.z < limit:
         known = final.free < size
@@ -309,7 +309,7 @@ def _flicker(fit: Fit, fitted: Fitted, counts: float = 8.0, windows: int = 64) -
     recording, size = fit.recording, min(float(fit.recording.photons), fit.effort.batch / 4.0)
     cycles = fit.cycles(size)
     rows = draws(fitted.model, fitted.unbounded, fitted.covariance, fitted.free)[:LIGHTS]
-    drawn = [Recording((t,), (cycles,), recording.clock) for t in fitted.model.streams(rows, cycles, 0)]
+    drawn = fitted.model.streams(rows, cycles, 0).stretches
     sizes = counts * 4.0 ** np.arange(16)
     lengths = sizes[sizes * windows < recording.photons] * recording.exposure / recording.photons
     if lengths.size == 1:

@@ -338,9 +338,7 @@ def calibrate(
             "exactly the time of the one before"
         )
     if recording.laser and described.look.own_period_ns is not None:
-        ratio = recording.period_ns / described.look.own_period_ns
-        if round(ratio) < 2 or abs(ratio - round(ratio)) > 1e-3:  # several pulses in a period repeat with it, too
-            raise ValueError(f"times must repeat with the laser period, but {described.look.problems[0]}")
+        raise ValueError(f"times must repeat with the laser period, but {described.look.problems[0]}")
     model = _model(recording, shape, number, fields, "jitter" in fixed)
     return _Run(described, model, fixed, start_seed).result()
 
@@ -416,21 +414,22 @@ class _Run:
 
         A fit that is rejected with every effect may be a local minimum: one by other streams is used if it fits.
         """
-        fit, fitted = self.first(attempt)
-        wrong = [] if self.accepts(fitted) else self.wrong_values(fitted)
-        drift = suspects.drift(fit, fitted) if fitted.converged else None
+        fit, plain = self.first(attempt)
+        wrong = [] if self.accepts(plain) else self.wrong_values(plain)
+        drift = suspects.drift(fit, plain) if plain.converged else None
+        fitted, other = plain, None
         included: list[tuple[Score, float]] = []
         trials: list[Trial] = []
-        if fitted.converged and not wrong and not (drift and drift.flickers):  # which looks like effects
-            fitted, included, trials = suspects.search(fit, fitted)
-            drift = suspects.drift(fit, fitted) if included else drift
+        if not wrong and not (drift and drift.flickers):  # which looks like effects
+            fitted, included, trials, other = suspects.search(fit, plain)
+            drift = drift if fitted is plain or not fitted.converged else suspects.drift(fit, fitted)
         if fitted.converged and not included:
             fitted = fit.repeated(fitted)
         if attempt == 0 and fitted.converged and not included and not wrong and fitted.p_value < FALSE_ALARM:
-            other = self.result(Effort.attempts)
-            if other.fits:
-                return other
-        return self.assembled(fitted, included, trials, drift, wrong)
+            again = self.result(Effort.attempts)
+            if again.fits:
+                return again
+        return self.assembled(fitted, included, trials, other, drift, wrong)
 
     def accepts(self, fitted: Fitted) -> bool:
         """Whether a fit converged and is not rejected."""
@@ -506,6 +505,7 @@ class _Run:
         fitted: Fitted,
         included: list[tuple[Score, float]],
         trials: list[Trial],
+        other: Fitted | None,
         drift: Drift | None,
         wrong: list[Suspect],
     ) -> Calibration:
@@ -531,7 +531,10 @@ class _Run:
         if p < min(self.described.level, FALSE_ALARM) and all(suspect.included for suspect in named):
             named.append(_worst_cells(fitted))
         others = [trial for trial in trials if fitted.p_value >= FALSE_ALARM and not trial.refuted]
-        limits = tuple(_limit(trial, estimates, drift) for trial in others)
+        limits = [_limit(trial, estimates, drift) for trial in others]
+        if other is not None:
+            words = "paralyzable detector in its other light"
+            limits.append(Limit("paralyzable", words, 1.0, _ranges(other, estimates, drift)))
         for name, own in estimates.items():
             ranges = [(own.low, own.high), *(limit.ranges[name] for limit in limits if name in limit.ranges)]
             lows, highs = zip(*ranges, strict=True)
@@ -544,7 +547,7 @@ class _Run:
             estimates=estimates,
             p_value=p,
             suspects=tuple(sorted(named, key=lambda suspect: (not suspect.included, -suspect.z))),
-            limits=limits,
+            limits=tuple(limits),
             drift=drift,
             system=model.system(centre, cycles, 1024) if known else None,
             flux=model.flux(centre) if known else None,
@@ -591,6 +594,11 @@ def _limit(trial: Trial, estimates: dict[str, Estimate], drift: Drift | None) ->
     if final is None or final.p_value < FALSE_ALARM:
         return Limit(effect.names[0], effect.words)
     sizes = draws(final.model, final.unbounded, final.covariance, final.free)[:, -len(effect.names)]
+    return Limit(effect.names[0], effect.words, float(np.quantile(sizes, 0.95)), _ranges(final, estimates, drift))
+
+
+def _ranges(final: Fitted, estimates: dict[str, Estimate], drift: Drift | None) -> dict[str, tuple[float, float]]:
+    """95 % intervals of a fit that extend beyond those of the result by more than its errors."""
     period, ranges = final.model.clock.period_ns, {}
     for name, other in _estimates(final, drift).items():
         own = estimates.get(name, other)
@@ -598,7 +606,7 @@ def _limit(trial: Trial, estimates: dict[str, Estimate], drift: Drift | None) ->
         low, high = other.low + turn, other.high + turn
         if max(own.low - low, high - own.high) > (own.high - own.low) / 3.92:
             ranges[name] = low, high
-    return Limit(effect.names[0], effect.words, float(np.quantile(sizes, 0.95)), ranges)
+    return ranges
 
 
 def _quantities(model: Model, rows: FloatArray) -> dict[str, tuple[FloatArray, str]]:
@@ -635,9 +643,8 @@ def _estimates(fitted: Fitted, drift: Drift | None = None) -> dict[str, Estimate
     values, samples = _quantities(model, centre), _quantities(model, drawn)
     errors = dict(zip([names[i] for i in fitted.free], np.sqrt(np.diag(covariance)).tolist(), strict=True))
     withheld: dict[str, str] = {}
-    if fitted.p_value < FALSE_ALARM:  # the scatter of the parts includes a misfit
-        still = [name for name, factor in zip(names, growth, strict=True) if not factor > 1.0]
-        withheld = dict.fromkeys(still, "of a model that does not fit: no error is stated")
+    if fitted.p_value < FALSE_ALARM:
+        withheld = dict.fromkeys(names, "of a model that does not fit: no error is stated")
     elif not fitted.lit:  # there may be another pulse
         words = "no significant pulse" if model.returns < 2 else "a return without significant signal"
         withheld = dict.fromkeys((*names[:k], "width", "jitter"), f"{words}: no error is stated")

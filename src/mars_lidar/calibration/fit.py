@@ -48,8 +48,6 @@ class Effort:
     longer, more, recentred
         The last streams have `longer` times as many photons, so that their parameters differ less; the batch that
         gives the weights has `more` times as many streams; it is recentred at most `recentred` times.
-    widths
-        Different pulse widths in a batch, because the table of a pulse takes as long as a stream.
     pieces
         Pieces of each stream whose counts are correlated.
     draws
@@ -78,7 +76,6 @@ class Effort:
     longer: float = 4.0
     more: int = 2
     recentred: int = 4
-    widths: int = 4
     pieces: int = 16
     draws: int = 20_000
     attempts: int = 3
@@ -168,11 +165,7 @@ def counted(model: Model, cells: Cells, rows: FloatArray, cycles: int, seed: int
 
 
 def design(model: Model, centre: FloatArray, root: FloatArray, free: Index, seed: int, number: int) -> FloatArray:
-    """Parameters (streams, p), normal of covariance root root' about the centre; `LIGHTS` rows share a detector.
-
-    Pulses have `Effort.widths` different widths, each the mean of a group of those drawn; the jitter makes up for the
-    difference.
-    """
+    """Parameters (streams, p), normal of covariance root root' about the centre; `LIGHTS` rows share a detector."""
     random, k = np.random.default_rng(seed), model.light
     varied = (free < k) | ((free == k + 1) & (not model.split))  # within a call of the engine
     order = np.argsort(varied, kind="stable")
@@ -189,17 +182,7 @@ def design(model: Model, centre: FloatArray, root: FloatArray, free: Index, seed
     rows[:, k : k + 2] = np.abs(rows[:, k : k + 2])
     if model.split:
         rows[:, k + 1] = np.arcsin(np.abs(np.sin(rows[:, k + 1])))
-    rows = model.bounded(rows)
-    if model.gaussian:
-        detectors = rows.reshape(number, LIGHTS, -1)  # a view
-        width, (pulse, jitter) = rows[::LIGHTS, k], model.widths(rows[::LIGHTS])
-        for part in np.array_split(np.argsort(pulse), Effort.widths):
-            mean = pulse[part].mean()
-            around = np.sqrt(np.maximum(width[part] ** 2 - mean**2, 0.0)) if model.split else jitter[part]
-            detectors[part, :, k] = np.hypot(mean, around)[:, None]
-            if model.split:
-                detectors[part, :, k + 1] = np.arctan2(around, mean)[:, None]
-    return rows
+    return model.bounded(rows)
 
 
 def root_of(cov: FloatArray) -> FloatArray:
@@ -318,6 +301,18 @@ class Fit:
     def cells(self, model: Model, theta: FloatArray, photons: float) -> Cells:
         """Cells of a law for this many photons, by streams at `theta`."""
         return Cells(model, theta, self.streams(model, theta, self.effort.of(photons)), photons)
+
+    def distance(self, model: Model, theta: FloatArray) -> float:
+        """Mean square of the differences of recorded counts from those of streams at `theta`, in standard deviations.
+
+        Of as many photons as the first steps weigh, and by the square roots of the counts, whose variance is even.
+        """
+        photons = min(self.recording.photons, self.effort.first)
+        cells = self.cells(model, theta, photons)
+        drawn = cells.count(self.streams(model, theta, photons))[:, 0]
+        recorded = cells.of(self.recording) * (photons / self.recording.photons)
+        off = 2.0 * np.sqrt(recorded + 0.375) - 2.0 * np.sqrt(drawn + 0.375).mean(0)
+        return float((off**2).mean())
 
     def law(self, guess: Guess, photons: float, cells: Cells, spread: float, times: float = 1, more: int = 1) -> Batch:
         """The linear law of counts about a guess for so many photons, by `more` streams, `times` as long."""
@@ -468,14 +463,15 @@ class Fit:
             early, shortest = self.shortest(model, rows)
             dead, timed = shortest.dead_time, free == model.light + 2
             error = float(np.sqrt(cov[timed, timed].sum()))
-            if timed.any() and (early < 0.05 or shortest.decides(float(mean[model.light + 2]), error)):
+            unknown = timed.any() and shortest.decides(float(mean[model.light + 2]), error)
+            if timed.any() and (early < 0.05 or unknown):
                 at = mean.copy()
                 at[model.light + 2] = dead[0]
                 own = Guess(model, at, root_of(cov[np.ix_(~timed, ~timed)]), free[~timed])
                 other = self.finish(self.steps(own, photons, photons / 6.0)[0], known=True)
                 if other.converged and other.p_value > FALSE_ALARM:
                     return other
-            if known:
+            if known or unknown:
                 interval, mean[model.light + 2] = dead, dead[0]
             elif early < FALSE_ALARM:
                 p = min(p, early)

@@ -141,7 +141,7 @@ def other_period(recording: Recording, cells: int = 2**20, slowest: float = 0.3)
     if first is None:
         return None
     first += int(np.argmax(power[first : first + 3]))
-    if abs(first - given) < 1.5 or _is_harmonic(power, near, first, given):
+    if abs(first - max(round(first / given), 1) * given) < 1.5:  # in pulses that also repeat with the given period
         return None
     around = np.pad(power, (0, 1), "reflect")[first - 1 : first + 2]
     period = float(length * cell / (first + (around[2] - around[0]) / around.sum()))
@@ -157,19 +157,6 @@ def _in_phase(periods: FloatArray, parts: int = 16) -> bool:
     phase, place = np.unwrap(np.angle(means)), np.arange(parts)
     off = phase - np.polyval(np.polyfit(place, phase, 1), place)  # the period is known to part of a line
     return bool((off**2).mean() < 0.25 * -2.0 * np.log(np.abs(means).mean()))
-
-
-def _is_harmonic(power: FloatArray, near: FloatArray, line: int, given: float) -> bool:
-    """Whether a line is a multiple of the given frequency whose lower multiples exist, weakened by a dead time."""
-    from scipy.stats import gamma
-
-    number = round(line / given)
-    if number < 2 or abs(line - number * given) > 1.5:
-        return False
-    lines = [round(k * given) for k in range(1, number)]
-    lower = [float(near[k]) / _neighbours(power, k) for k in lines]
-    # the strongest of three lines each
-    return bool(gamma.sf(sum(lower), number - 1) * 3.0 ** (number - 1) < FALSE_ALARM)
 
 
 def _neighbours(power: FloatArray, line: int) -> float:

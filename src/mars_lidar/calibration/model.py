@@ -159,6 +159,11 @@ class Model:
         return self.gaussian and not self.jitter_given
 
     @property
+    def paralyzable(self) -> bool:
+        """Whether the detector is paralyzable."""
+        return "paralyzable" in (*self.names, dict(self.fields).get("mode"))
+
+    @property
     def light(self) -> int:
         """Parameters of the light that a call of the engine varies from stream to stream."""
         return 1 + 2 * self.returns

@@ -11,6 +11,7 @@ import numpy as np
 from mars_lidar._base import checks
 from mars_lidar._base.cached import cached_property
 from mars_lidar._base.types import ArrayLike, FloatArray, NDArray
+from mars_lidar.instrument.tolerances import TOL
 from mars_lidar.light.timestamps import Timestamps
 
 _ON_GRID = 0.02  # units: distance from a tick of the clock that rounding of float64 times over an hour can cause
@@ -78,6 +79,17 @@ class Recording:
         """Intervals (n,) between successive registrations, ns, of all stretches, sorted."""
         return np.sort(np.concatenate([np.diff(piece) for piece in self.pieces]))
 
+    @cached_property
+    def armed_ns(self) -> float:
+        """Time after a registration from which the pixel is armed: intervals are shorter by jitter alone.
+
+        The shortest ones scatter by the jitter, and in dim light by far more than the largest jitter of the model.
+        """
+        gaps = self.intervals
+        low, edge = gaps[np.minimum([1, max(30, gaps.size // 500)], gaps.size - 1)]
+        hold = low + 4.0 * min(edge - low, 2.0 * TOL.jitter_periods * self.period_ns) + 2.0 * self.clock.unit_ns
+        return float(min(hold, np.quantile(gaps, 0.95)))  # of a saturated detector few are longer
+
     def counts(self, window: float) -> list[NDArray[np.int64]]:
         """Counts (windows,) of each stretch in its successive windows of `window` periods."""
         at = [(piece / (window * self.period_ns)).astype(np.int64) for piece in self.pieces]
@@ -130,11 +142,9 @@ def free_waveform(recording: Recording, most: int) -> tuple[FloatArray, FloatArr
     """Light (bins,) of any shape in photons per period and bin, without dead time, and its standard errors.
 
     A bin records one photon a pass, with the probability 1 - exp(-light). Passes are counted from beyond the shortest
-    intervals on, where the pixel is certainly armed.
+    intervals on, where the pixel is armed.
     """
-    gaps, clock = recording.intervals, recording.clock
-    low, edge = gaps[np.minimum([1, max(30, gaps.size // 500)], gaps.size - 1)]
-    hold = float(edge + 3.0 * (edge - low) + 2.0 * clock.unit_ns)
+    clock, hold = recording.clock, recording.armed_ns
     # whole units of the clock in each bin, if possible; every number divides 0, where the period has no whole units
     bins = max((n for n in range(most // 8, most + 1) if clock.units % n == 0), default=most)
     hits, passes = np.sum([free_light(piece, clock, hold, bins) for piece in recording.pieces], axis=0)
@@ -152,7 +162,7 @@ def brightest_window(recording: Recording, streams: Recording | None = None) -> 
     from scipy.special import ndtr
 
     rate, error = free_waveform(recording, 512)
-    made = [] if streams is None else streams.stretches
+    made = [] if streams is None else [each for each in streams.stretches if each.photons > 1]
     drawn = np.array([free_waveform(each, rate.size)[0] for each in made] or [np.zeros(rate.size)])
     ratio = recording.exposure / streams.cycles[0] if streams is not None else 0.0
     best, limit = -np.inf, 0.0

@@ -23,36 +23,34 @@ def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
     windows = np.linspace(0, bins, 64, endpoint=False).astype(int)
     coarse = np.add.reduceat(hits, windows) / np.maximum(np.add.reduceat(passes, windows), 1.0)
     faint = max(float(np.median(coarse)), 1e-3 / max(passes.sum(), 1.0))
-    boxes = np.unique(np.round(1.5 ** np.arange(30)).astype(int))  # of every width
-    peaks, variance = [], 0.0
+    boxes = np.unique(np.round(1.5 ** np.arange(np.log(bins / 4) / np.log(1.5))).astype(int))  # of every width
+    peaks, variance, widths = [], 0.0, 4.5 if model.returns == 1 else 3.0
     for _ in range(model.returns):
-        best = (-np.inf, 0, 1)
-        masked = np.where(outside, hits, faint * passes)
-        for m in boxes[boxes <= bins // 4]:
+        masked, ratios = np.where(outside, hits, faint * passes), []
+        for m in boxes:
             sums = [np.cumsum(np.r_[0.0, x, x[: m - 1]]) for x in (masked, passes)]
             inside, armed = (c[m:] - c[:-m] for c in sums)
             expected = np.maximum(faint * armed, 1e-9)
             more = np.maximum(inside, expected)
-            z = more * np.log(more / expected) - (more - expected)  # log likelihood ratio of a brighter window
-            best = max(best, (float(z.max()), int(z.argmax()), int(m)))
-        _, at, m = best
-        peak, least = (at + m / 2) * cell, max(0.8 * m, 2) * cell
-        reach = 1.6 * least
-        for _ in range(4):
+            ratios.append(more * np.log(more / expected) - (more - expected))  # log likelihood of a brighter window
+        best = np.max(ratios, axis=1)
+        first = int(np.argmax(best > 0.7 * best.max()))  # the narrowest that is about as likely holds one return only
+        peak, sd = float(np.argmax(ratios[first]) + boxes[first] / 2) * cell, float(boxes[first]) * cell / 3
+        for _ in range(6):
             off = (place - peak + period / 2) % period - period / 2
+            reach = float(np.clip(widths * sd, 2.0 * cell, 0.3 * period))
             inside = np.abs(off) < reach
             rest = outside & ~inside
             faint = float((hits[rest].sum() + 1e-3) / max(passes[rest].sum(), 1.0))
-            extra = (rate - faint)[inside & outside]
-            near = off[inside & outside]
+            pulse = inside & outside & (passes > 0.003 * passes.max())  # not what a bright pulse hides
+            extra, near = (rate - faint)[pulse], off[pulse]
             signal = max(float(extra.sum()), 1e-4)
             mean = float(np.clip((extra * near).sum() / signal, -reach, reach))
-            var = max(float((extra * (near - mean) ** 2).sum() / signal), (0.2 * m * cell) ** 2)
+            sd = max(float((extra * (near - mean) ** 2).sum() / signal), (0.02 * boxes[first] * cell) ** 2) ** 0.5
             peak += mean
-            reach = float(np.clip(4.5 * np.sqrt(var), least, 0.3 * period))
         outside &= ~inside
         peaks += [signal, peak % period]
-        variance = variance or var
+        variance = variance or sd**2
     own = max(variance - unit**2 / 6, 0.0025 * variance, (0.15 * unit) ** 2)
     return np.array([max(faint * bins, 1e-5), *peaks, own**0.5])
 
@@ -60,14 +58,12 @@ def light(t: FloatArray, model: Model, hold: float) -> FloatArray:
 def starts(fit: Fit, model: Model, fixed: dict[str, float]) -> list[FloatArray]:
     """Parameters (p,) for seven shares of jitter in the recorded width, sorted by the misfit."""
     k, unit, recording = model.light, model.clock.unit_ns, fit.recording
-    photons = min(recording.photons, fit.effort.first)
     observed, _ = _short_intervals(fit)
-    hold = max(4 * observed[-3] - 3 * observed[0], fixed.get("dead_time_ns", 0.0)) + 2 * unit
-    hold = min(hold, float(np.quantile(recording.intervals, 0.95)))  # of a saturated detector few are longer
+    hold = max(recording.armed_ns, fixed.get("dead_time_ns", 0.0))
     if model.returns == 0:
         first = np.array([free_waveform(recording, 64)[0].sum(), max((observed[-3] - observed[0]) / 4, 0.3 * unit)])
     else:
-        first = light(recording.pieces[0][: 12 * photons], model, hold)
+        first = light(recording.pieces[0][: 12 * fit.effort.first], model, hold)
     tried = []
     # from no jitter to a width of jitter alone
     for angle in np.linspace(0.0, np.pi / 2.0, 1 if "jitter" in fixed else 7):
@@ -75,14 +71,8 @@ def starts(fit: Fit, model: Model, fixed: dict[str, float]) -> list[FloatArray]:
         theta[k + 1] = fixed.get("jitter", angle if model.split else np.sin(angle) * theta[k])
         theta[k + 2] = fixed.get("dead_time_ns", max(observed[0], 0.05 * observed[-1]) + 2 * model.widths(theta)[1])
         tried.append(theta if "dead_time_ns" in fixed else with_edge(fit, model, theta))
-    trials = []
-    for theta in (*tried, saturated(recording.intervals, model, np.r_[first, 0.0, 0.0], fixed)):
-        cells = fit.cells(model, theta, photons)
-        rows = cells.count(fit.streams(model, theta, photons))[:, 0]
-        recorded = cells.of(recording) * (photons / recording.photons)
-        r = (2 * np.sqrt(recorded + 0.375) - 2 * np.sqrt(rows + 0.375).mean(0)) ** 2
-        trials.append((float(r.sum()), theta))
-    return [theta for _, theta in sorted(trials, key=lambda pair: pair[0])]
+    tried.append(saturated(recording.intervals, model, np.r_[first, 0.0, 0.0], fixed))
+    return sorted(tried, key=lambda theta: fit.distance(model, theta))
 
 
 def saturated(gaps: FloatArray, model: Model, theta: FloatArray, fixed: dict[str, float]) -> FloatArray:

@@ -20,6 +20,9 @@ from mars_lidar.calibration.start import with_edge
 _SIGNIFICANT = NormalDist().inv_cdf((1.0 - FALSE_ALARM) ** (1.0 / 7.0))
 
 
+_FAR = 5.0  # standard deviations of each count, on average, by which light that is not fitted is wrong
+
+
 class Score(NamedTuple):
     """Size of an effect from the residual counts, its standard deviation, and the shift of the parameters.
 
@@ -46,6 +49,7 @@ class Scores:
     def __init__(self, fit: Fit, fitted: Fitted) -> None:
         self.fit, self.fitted = fit, fitted
         self._plain: dict[float, tuple[FloatArray, float]] = {}
+        self.tested: list[Score] = []
 
     def counts(self, model: Model, theta: FloatArray, times: float = 1.0) -> tuple[FloatArray, float]:
         """Counts that a model expects in the cells of the fit, by `times` a batch; ratio of their variance to them."""
@@ -81,17 +85,19 @@ class Scores:
         score = Score(effect, float(fitted.rest @ along), spread, along, part, shift)
         off, grown = 2.0 * part**0.5, score.z * max(1.0 - part, 0.01) ** -0.5
         if score.z < 1.0 or part < effort.noise or times > 1.0 or not score.z - off < _SIGNIFICANT < grown + off:
+            self.tested.append(score)
             return score
         return self.of(effect, theta, min(effort.closest, np.ceil(part / effort.noise)))
 
-    def limit(self, tested: list[Score]) -> float:
-        """What the largest of these scores exceeds by chance with the probability of a false alarm.
+    @property
+    def limit(self) -> float:
+        """What the largest of all scores so far exceeds by chance with the probability of a false alarm.
 
         They are about normal, with the correlations that they have in streams of the fit.
         """
-        drawn = self.fitted.fresh @ np.array([score.along for score in tested]).T
-        root = root_of(np.corrcoef(drawn, rowvar=False).reshape(len(tested), -1))
-        largest = (np.random.default_rng(0).standard_normal((100_000, len(tested))) @ root.T).max(1)
+        drawn = self.fitted.fresh @ np.array([score.along for score in self.tested]).T
+        root = root_of(np.corrcoef(drawn, rowvar=False).reshape(len(self.tested), -1))
+        largest = (np.random.default_rng(0).standard_normal((100_000, len(self.tested))) @ root.T).max(1)
         return float(np.quantile(largest, 1.0 - FALSE_ALARM))
 
 
@@ -99,7 +105,7 @@ def possible(scores: Scores) -> list[Trial]:
     """Effects that the stream may have beyond the model, one trial of each kind.
 
     Afterpulses start from the mean delay with the largest score. A paralyzable detector, of size 1, is left out of a
-    stream that fits if the 95 % upper limit of its score is below 1.
+    stream that fits if its size is significantly below 1.
     """
     fitted = scores.fitted
     model = fitted.model
@@ -114,18 +120,17 @@ def possible(scores: Scores) -> list[Trial]:
         if effect.names[0] not in have:
             with suppress(ValueError):  # a detector cannot have both
                 score = scores.of(effect, np.r_[centre, effect.start])
-                if not effect.onoff or fitted.p_value < FALSE_ALARM or score.size + 1.645 * score.error > 1.0:
+                most = (score.size + _SIGNIFICANT * score.error) / max(1.0 - score.noise, 1e-9)  # noise lowers the size
+                if not effect.onoff or fitted.p_value < FALSE_ALARM or most > 1.0:
                     tested.setdefault(effect.names[0], []).append(score)
-    limit = scores.limit([score for own in tested.values() for score in own]) if tested else np.inf
-    largest = [max(own, key=lambda score: score.z) for own in tested.values()]
-    return [Trial(scores.fit, fitted, score, score.z > limit) for score in largest]
+    return [Trial(scores.fit, fitted, max(own, key=lambda score: score.z)) for own in tested.values()]
 
 
 class Trial:
     """A further effect by its score, and the fit with it, made when it is asked for."""
 
-    def __init__(self, fit: Fit, fitted: Fitted, score: Score, clear: bool) -> None:
-        self.fit, self.fitted, self.score, self.effect, self.clear = fit, fitted, score, score.effect, clear
+    def __init__(self, fit: Fit, fitted: Fitted, score: Score) -> None:
+        self.fit, self.fitted, self.score, self.effect = fit, fitted, score, score.effect
         self.model = replace(fitted.model, effects=(*fitted.model.effects, self.effect))
 
     @cached_property
@@ -146,34 +151,32 @@ class Trial:
         free = np.r_[np.union1d(fitted.free, timed), more].astype(np.intp)
         return Guess(self.model, theta, np.diag(spread[free]), free)
 
-    @cached_property
-    def direct(self) -> Fitted | None:
-        """The fit by full batches from the size that a significant score gives, if it fits; else None."""
-        if not self.clear:
-            return None
-        guess, fitted = self.guess, self.fitted
-        near = np.diag(guess.root).copy()
-        near[np.isin(guess.free, fitted.free)] = np.sqrt(np.diag(fitted.covariance))
-        near[guess.free == fitted.model.size] = self.score.error
+    def refit(self, direct: bool = False) -> Fitted | None:
+        """The fit with the effect, tested by fresh streams; None if no detector can have it, or it did not converge.
+
+        `direct`: by full batches, from the size that the score gives; else by steps, and short batches.
+        """
+        guess, fitted, photons = self.guess, self.fitted, float(self.fit.recording.photons)
+        fit = self.fit if direct else self.fit.shorter
         with suppress(ValueError, np.linalg.LinAlgError):
-            final = self.fit.finish(guess._replace(root=np.diag(near)))
-            if final.converged and final.p_value > FALSE_ALARM:
+            if direct:
+                near = np.diag(guess.root).copy()
+                near[np.isin(guess.free, fitted.free)] = np.sqrt(np.diag(fitted.covariance))
+                near[guess.free == fitted.model.size] = self.score.error
+                guess = guess._replace(root=np.diag(near))
+            else:
+                if fitted.model.light + 2 in guess.free:  # the dead time has absorbed part of the effect
+                    guess = guess._replace(theta=with_edge(fit, self.model, guess.theta))
+                guess = fit.steps(guess, photons, photons / 6.0)[0]
+            final = fit.finish(guess)
+            if final.converged:
                 return final
         return None
 
     @cached_property
     def final(self) -> Fitted | None:
-        """The fit with the effect, tested by fresh streams; None if no detector can have it, or it did not converge."""
-        if self.direct is not None:
-            return self.direct
-        fit, guess, photons = self.fit.shorter, self.guess, float(self.fit.recording.photons)
-        with suppress(ValueError, np.linalg.LinAlgError):
-            if self.fitted.model.light + 2 in guess.free:  # the dead time has absorbed part of the effect
-                guess = guess._replace(theta=with_edge(fit, self.model, guess.theta))
-            final = fit.finish(fit.steps(guess, photons, photons / 6.0)[0])
-            if final.converged:
-                return final
-        return None
+        """The fit by short batches."""
+        return self.refit()
 
     @property
     def refuted(self) -> bool:
@@ -181,8 +184,8 @@ class Trial:
         return self.effect.onoff and self.final is not None and self.final.p_value < FALSE_ALARM
 
 
-def search(fit: Fit, fitted: Fitted) -> tuple[Fitted, list[tuple[Score, float]], list[Trial]]:
-    """The fit with the effects that the stream shows, their scores and gains, and the trials of all others.
+def search(fit: Fit, fitted: Fitted) -> tuple[Fitted, list[tuple[Score, float]], list[Trial], Fitted | None]:
+    """The fit with the effects that the stream shows, their scores and gains, trials of all others, and `other_light`.
 
     A gain is the decrease of the misfit, in its standard deviations.
     """
@@ -195,7 +198,35 @@ def search(fit: Fit, fitted: Fitted) -> tuple[Fitted, list[tuple[Score, float]],
             break
         fitted, effect = better
         included += effect
-    return fitted, included, trials
+        if fitted.model.paralyzable and fitted.p_value < FALSE_ALARM:
+            fitted = other_light(fit, fitted) or fitted
+    of = [trial for trial in trials if trial.effect.onoff and (fitted.p_value < FALSE_ALARM or not trial.refuted)]
+    paralyzable = fitted if fitted.model.paralyzable else next((trial.final for trial in of), None)
+    other = other_light(fit, paralyzable) if paralyzable is not None else None
+    if other is not None and fitted.p_value < FALSE_ALARM:
+        included += [(trial.score, fitted.misfit_z - other.misfit_z) for trial in of]
+        return other, included, possible(Scores(fit, other)), None
+    return fitted, included, trials, other
+
+
+def other_light(fit: Fit, fitted: Fitted) -> Fitted | None:
+    """The fit of a paralyzable detector in the other light, if it is not rejected.
+
+    In constant light its intervals depend on x * exp(-x) alone, x photons in a dead time, so that there are two of it.
+    """
+    from scipy.special import lambertw
+
+    model, theta, photons = fitted.model, fitted.model.bounded(fitted.theta), float(fit.recording.photons)
+    amounts = [0, *range(1, model.light, 2)]
+    x = float(theta[amounts].sum() * theta[model.light + 2] / model.clock.period_ns)
+    theta[amounts] *= -lambertw(-x * np.exp(-x), -1 if x < 1.0 else 0).real / x
+    with suppress(ValueError, np.linalg.LinAlgError):
+        if fit.distance(model, theta) < _FAR**2:
+            guess = Guess(model, theta, np.diag(0.5 * model.scale(theta)[fitted.free]), fitted.free)
+            final = fit.finish(fit.steps(guess, photons, photons / 6.0)[0])
+            if final.converged and final.p_value > FALSE_ALARM:
+                return final
+    return None
 
 
 def refitted(scores: Scores, trials: list[Trial]) -> tuple[Fitted, list[tuple[Score, float]]] | None:
@@ -203,37 +234,40 @@ def refitted(scores: Scores, trials: list[Trial]) -> tuple[Fitted, list[tuple[Sc
 
     Beside the fit with an effect stand the effect's larger score and its gain.
 
-    An effect is significant if its refit fits where the model is rejected, with a p-value 500 times as large (that of a
-    model rejected by chance, or beside a poor fit, grows less); or if the refit is not worse and the
+    An effect is significant if its refit fits where the model is rejected; or if the refit is not worse and the
     residual counts have a significant score, along the change by a small effect or along that by the effect of the
     refit. (The first alone misleads: a slow recovery has the score of a paralyzable detector, and an effect that the
     dead time has absorbed has none.) Of light of free shape, which follows the recorded phases, only the misfit counts.
-    Where the refit with the least misfit is by short batches, it is repeated by full ones. The fit without the effect
-    is repeated, too, from the same place and with other streams: the mean of the scores beside both must be
-    significant, or both rejected, since a score has noise of the fit that it stands beside.
+    The refit with the least misfit is repeated by full batches. The fit without the effect is repeated, too, from the
+    same place and with other streams: the mean of the scores beside both must be significant, or both rejected, since
+    a score has noise of the fit that it stands beside.
     """
     fit, fitted = scores.fit, scores.fitted
     size = fitted.model.size
 
+    p_value = fitted.p_value if fitted.converged else 0.0
+
     def better(final: Fitted) -> bool:
-        return bool(final.theta[size] > 0.0 and final.p_value > min(FALSE_ALARM, fitted.p_value))
+        return bool(final.theta[size] > 0.0 and final.p_value > min(FALSE_ALARM, p_value))
 
-    refits: list[tuple[Trial, Fitted, Score]] = []
-    tested = [trial.score for trial in trials]
-    for trial in [trial for trial in trials if trial.direct is not None] or trials:
-        final = trial.final
-        if final is not None and better(final):
-            own = scores.of(trial.effect, final.theta) if trial.direct is None else trial.score
-            refits.append((trial, final, max(trial.score, own, key=lambda score: score.z)))
-            tested += [own] if own.noise < 1.0 else []
-    limit = scores.limit(tested)
+    def significant(final: Fitted, z: float, p_value: float = p_value) -> bool:
+        clear = z > limit and fitted.converged and final.model.waveform is None
+        return clear or p_value < FALSE_ALARM < final.p_value
 
-    def significant(final: Fitted, z: float, p_value: float = fitted.p_value) -> bool:
-        clear = z > limit and final.model.waveform is None
-        return clear or (p_value < FALSE_ALARM * final.p_value and final.p_value > FALSE_ALARM)
+    def score_of(trial: Trial, final: Fitted) -> Score:
+        return max(trial.score, scores.of(trial.effect, final.theta), key=lambda score: score.z)
 
-    candidates = [each for each in refits if significant(each[1], each[2].z)]
-    if not candidates:
+    limit = scores.limit
+    clear = [trial for trial in trials if trial.score.z > limit]
+    for direct in (True, False):
+        refits = [(trial, trial.refit(True) if direct else trial.final) for trial in (clear if direct else trials)]
+        good = [(trial, final) for trial, final in refits if final is not None and better(final)]
+        scored = [(trial, final, score_of(trial, final)) for trial, final in good]
+        limit = scores.limit
+        candidates = [each for each in scored if significant(each[1], each[2].z)]
+        if candidates:
+            break
+    else:
         return None
     trial, final, score = min(candidates, key=lambda each: each[1].misfit_z)
     # the fit without the effect once more, from the place of the refit: the first one may have been bad
@@ -244,13 +278,11 @@ def refitted(scores: Scores, trials: list[Trial]) -> tuple[Fitted, list[tuple[Sc
         if other.converged:
             small = np.r_[fitted.model.bounded(other.theta), trial.effect.start]
             again = Scores(fit, other).of(trial.effect, small if score is trial.score else final.theta)
-            if not significant(final, 0.5 * (score.z + again.z), max(fitted.p_value, other.p_value)):
-                return (other, []) if fitted.p_value < FALSE_ALARM else None
-    if trial.direct is None:
-        last = fit.finish(final.guess, finished=True)
-        if last.converged:
-            own = scores.of(trial.effect, last.theta)
-            final, score = last, max(trial.score, own, key=lambda score: score.z)
+            if not significant(final, 0.5 * (score.z + again.z), max(p_value, other.p_value)):
+                return (other, []) if p_value < FALSE_ALARM else None
+    last = final if direct else fit.finish(final.guess, finished=True)
+    if last is not final and last.converged:
+        final, score = last, score_of(trial, last)
     if not (better(final) and significant(final, score.z)):
         return None
     return final, [(score, fitted.misfit_z - final.misfit_z)]
@@ -315,7 +347,8 @@ def _flicker(fit: Fit, fitted: Fitted, counts: float = 8.0, windows: int = 64) -
     if lengths.size == 1:
         return 0.0, -np.inf, 1.0, 1.0
     table = [[x.unevenness(length) for x in (recording, *drawn)] for length in lengths]
-    variance, number, mean = np.maximum(np.array(table).transpose(2, 0, 1), 1e-300)  # (windows, streams) each
+    variance, number, mean = np.array(table).transpose(2, 0, 1)  # (windows, streams) each
+    variance = np.maximum(variance, 1.0 / number)  # of one count more in one window
     expected = variance[:, 1:].mean(1)
     ratio, even = variance[:, 0] / expected, 3.0 / number[:, 0] + 3.0 / number[:, 1:].sum(1)  # of even counts
     scatter = np.log(variance[1:, 1:] / variance[0, 1:]).var(1, ddof=1) * number[1:, 1:].mean(1) / number[1:, 0]

@@ -3,8 +3,8 @@
 Given the registrations before, those of a bin are binomial in the passes in which it was armed (R9), at the most likely
 light of each pixel. The law of a parameter, for a flat prior, is the share of the likelihood in cells, of which likely
 ones are divided until none holds much: of the dead time at the most likely width for each, and of the width at typical
-dead times. Value, error and interval are its median, root mean square and quantiles. What the
-likelihood of bins, in which light and armed passes count as even, does to simulated cubes is an error as well.
+dead times. Value, error and interval are its median, root mean square and quantiles, less the mean error that the
+likelihood of bins, in which light and armed passes count as even, makes of simulated cubes, with the scatter of those.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def calibrate_cube(
     cube
         (..., bins) counts.
     system
-        The recording system, with a free-running detector. Its dead time and pulse width are starting values of the
+        The recording system, with a nonparalyzable detector. Its dead time and pulse width are starting values of the
         fit, which tries all dead times within ten periods that the counts allow, and widths of up to eleven times more
         or less.
     pulse
@@ -103,7 +103,7 @@ def calibrate_cube(
     Raises
     ------
     ValueError
-        A detector that is not free-running, or no pixel with 1000 registrations.
+        A detector that is not nonparalyzable, or no pixel with 1000 registrations.
     """
     from scipy.optimize import minimize_scalar
 
@@ -111,7 +111,7 @@ def calibrate_cube(
     given, _ = checked(cube, system, 1)
     if not tested_recordings(system):
         raise ValueError(
-            f"system must have a free-running detector and many cycles to calibrate a cube, got mode "
+            f"system must have a nonparalyzable detector and many cycles to calibrate a cube, got mode "
             f"{system.detector.mode!r} and {system.cycles:,} cycles"
         )
     totals = given.counts.sum(1)
@@ -165,11 +165,12 @@ def calibrate_cube(
     laws = [width_law(dead) for dead in (hold.value, *typical)]
     places, share = np.concatenate(laws, axis=1)
     sigma, sigma_width = _estimate(places, share, np.arange(places.size) < laws[0][0].size)
+    at, widths_of = (hold.value, sigma.value), (hold_width, sigma_width)
+    off = _errors(trial, some, at, widths_of)
+    hold, sigma = (_corrected(*each) for each in zip((hold, sigma), widths_of, off, strict=True))
+    estimates = {"dead_time_ns": hold, "pulse_sigma_ns": sigma}
     final, response_error = trial(hold.value, sigma.value), None
     light = MaximumLikelihood().estimate(Histograms(some, final, 1))
-    off = _errors(trial, _flux(light, final), (hold.value, sigma.value), (hold_width, sigma_width))
-    hold, sigma = _widened(hold, hold_width, off[0]), _widened(sigma, sigma_width, off[1])
-    estimates = {"dead_time_ns": hold, "pulse_sigma_ns": sigma}
     if pulse == "free":
 
         def with_response(dead: float) -> tuple[System, FloatArray]:
@@ -178,7 +179,7 @@ def calibrate_cube(
         # a dead time just below a period looks like the tail of a pulse, so that each is tried with its own response
         edges = np.unique(np.clip(hold.value + system.period_ns * np.linspace(-1.05, 1.05, 22), 0.0, most))
         deads, share = _law(lambda dead: _log_likelihood(some, with_response(dead)[0]), edges[:-1], edges[1:])
-        estimates = {"dead_time_ns": _widened(_estimate(deads, share, share >= 0.0)[0], hold_width, off[0])}
+        estimates = {"dead_time_ns": _corrected(_estimate(deads, share, share >= 0.0)[0], hold_width, off[0])}
         final, response_error = with_response(estimates["dead_time_ns"].value)
         light = MaximumLikelihood().estimate(Histograms(some, final, 1))
     p_values = np.asarray(light.p_value)
@@ -203,45 +204,55 @@ def _flux(light: Estimates, system: System) -> Flux:
 
 
 def _errors(
-    trial: Callable[[float, float], System], flux: Flux, at: tuple[float, float], widths: tuple[float, float]
+    trial: Callable[[float, float], System], cube: FloatArray, at: tuple[float, float], widths: tuple[float, float]
 ) -> tuple[FloatArray, FloatArray]:
     """Errors (cubes,) of the dead time and of the pulse's width of simulated cubes, ns, of systems near the estimates.
 
-    The likelihood takes light and armed passes as even within a bin, so that where a dead time ends in a pulse several
-    true ones have about the same estimate. So true ones lie three bins, or three `widths` of its law, on either side of
-    the estimate, and errors are those of the cubes whose estimates are a third as near.
+    The likelihood takes light and armed passes as even within a bin, which biases dead time and width together, and
+    where a dead time ends in a pulse several true ones have about the same estimate. So true ones lie three bins, or
+    three `widths` of its law, on either side of the estimate, each with the most likely light of the `cube`, and errors
+    are those of the cubes whose estimates are a third as near.
     """
     (dead, sigma), bin_ns = at, trial(*at).bin_ns
     reach = 3.0 * max(bin_ns, widths[0])
     edges = np.unique(np.maximum(dead + reach * np.linspace(-1.5, 1.5, 13), 0.0))
-    off, logs = [], []
+    off = []
     for k, true in enumerate(np.maximum(dead + reach * np.linspace(-1.0, 1.0, _SIMULATED), 0.0)):
-        counts = np.ascontiguousarray(simulate(flux, trial(float(true), sigma), seed=k)[0, 0])
+        system = trial(float(true), sigma)
+        light = MaximumLikelihood().estimate(Histograms(cube, system, 1))
+        counts = np.ascontiguousarray(simulate(_flux(light, system), system, seed=k)[0, 0])
 
-        def log(dead: float, sigma: float = sigma, counts: Any = counts) -> float:
-            return _log_likelihood(counts, trial(dead, sigma))
+        def at_width(dead: float, counts: Any = counts) -> tuple[float, float]:
+            """Largest logarithm of the likelihood, and where: of a parabola through three widths."""
+            below, middle, above = (_log_likelihood(counts, trial(dead, sigma + x * widths[1])) for x in (-1, 0, 1))
+            slope, bend = 0.5 * (above - below), max(2.0 * middle - below - above, 0.25)  # 1 of a normal law
+            return middle + 0.5 * slope**2 / bend, widths[1] * slope / bend
+
+        def log(dead: float, of: Callable[[float], tuple[float, float]] = at_width) -> float:
+            return of(dead)[0]
 
         places, share = _law(log, edges[:-1], edges[1:])
         estimate = _estimate(places, share, share >= 0.0)[0].value
         if abs(estimate - dead) < reach / 3.0:
-            off.append(estimate - true)
-            logs.append([log(estimate, sigma + step * widths[1]) for step in (-1.0, 0.0, 1.0)])
-    if not off:
-        return np.array([reach]), np.array([widths[1]])
-    below, middle, above = np.array(logs).T
-    bend = max(float(np.mean(2.0 * middle - below - above)), 0.25)  # 1 of a normal law
-    return np.array(off), widths[1] * 0.5 * (above - below) / bend
+            off.append((estimate - dead, true - dead, at_width(estimate)[1]))
+    if len(off) < 3:
+        return np.array([-reach, reach]), np.array([-widths[1], widths[1]])
+    # true dead times less what the estimates explain of them (Beaumont et al., Genetics 162, 2025, 2002)
+    estimated, true, wide = np.array(off).T
+    slope = np.cov(estimated, true)[0, 1] / (estimated.var(ddof=1) + widths[0] ** 2)
+    return slope * estimated - true, wide
 
 
-def _widened(own: Estimate, width: float, off: FloatArray) -> Estimate:
-    """An estimate with at least the root mean square of the errors `off`, and the largest within its interval.
+def _corrected(own: Estimate, width: float, off: FloatArray) -> Estimate:
+    """An estimate less the mean of the errors `off` (n,), with at least their scatter, and the largest in its interval.
 
     `width`: standard deviation of the law of the nearest maximum; the interval ends at another one may be as far off.
     """
-    largest, spread = float(np.abs(off).max()), float((off**2).mean() ** 0.5)
+    mean, largest = float(off.mean()), float(np.abs(off - off.mean()).max())
+    value, error = max(own.value - mean, 0.0), float(np.sqrt(off.var(ddof=1) * (1.0 + 1.0 / off.size)))
     grown = max(largest - 1.96 * width, 0.0)
-    low, high = min(own.low - grown, own.value - largest), max(own.high + grown, own.value + largest)
-    return replace(own, error=max(own.error, spread), low=low, high=high)
+    low, high = min(own.low - mean - grown, value - largest), max(own.high - mean + grown, value + largest)
+    return replace(own, value=value, error=max(own.error, error), low=low, high=high)
 
 
 def _of_pixel(light: Estimates, name: str, k: int, unit: float = 1.0) -> Estimate:
@@ -328,12 +339,15 @@ def _law(value: Callable[[float], float], low: FloatArray, high: FloatArray) -> 
 
 
 def _estimate(places: FloatArray, share: FloatArray, near: BoolArray) -> tuple[Estimate, float]:
-    """Median of the places `near`, root mean square of all about it, and 95 % interval of all; that of those near."""
+    """Median of the places `near`, error and 95 % interval by all; standard deviation of those near.
+
+    The error is the root mean square about the median, of the central 99 %.
+    """
     order = np.argsort(places)
     places, share, near = places[order], share[order] / share.sum(), near[order]
     value = float(np.interp(0.5 * share[near].sum(), np.cumsum(share * near) - 0.5 * share * near, places))
-    low, high = np.interp([0.025, 0.975], np.cumsum(share) - 0.5 * share, places)
-    square = share * (places - value) ** 2
+    least, low, high, most = np.interp([0.005, 0.025, 0.975, 0.995], np.cumsum(share) - 0.5 * share, places)
+    square = share * (np.clip(places, least, most) - value) ** 2
     local = float(square[near].sum() / share[near].sum()) ** 0.5
     return Estimate(value, float(square.sum()) ** 0.5, float(low), float(high)), local
 

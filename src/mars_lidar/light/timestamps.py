@@ -28,7 +28,8 @@ class Timestamps:
     Attributes
     ----------
     times_ns
-        (n,) absolute times since the start of the exposure, ns, sorted within a pixel.
+        (n,) absolute times since the start of the exposure, ns, sorted within a pixel; of a recording
+        clock the middle of each unit.
     cycle
         (n,) int32, laser period of each registration, from 0.
     bin

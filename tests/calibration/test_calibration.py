@@ -207,13 +207,12 @@ def test_a_dead_time_that_ends_in_the_dark(seed: int) -> None:
 def test_a_dead_time_that_ends_in_a_faint_background(seed: int) -> None:
     """Beside a jitter of the whole width 167.4 ± .6 ns was stated for 157.7: no photon tells, between 135 and 168.
 
-    An interval alone is stated by eight of nine seeds. By seed 1 counts claim a little more than half of the width that
-    intervals allow, so that theirs stands: 158.7 ± 3.0.
+    Most seeds state an interval alone, others an error of 3 to 5 ns.
     """
     truth = replace(BASE, signal=2.066, background=2e-5, delay=31.8, sigma=0.037, jitter=0.275)
     truth = replace(truth, dead=157.7, period=33.576, unit=0.097)
     dead = ml.calibrate(stream(truth, 20_000, seed), seed=seed).estimates["dead_time_ns"]
-    assert np.isnan(dead.error) or (seed == 1 and abs(dead.value - truth.dead) < 2.0 * dead.error)
+    assert np.isnan(dead.error) or abs(dead.value - truth.dead) < 2.0 * dead.error
     assert dead.low <= truth.dead <= dead.high
 
 
@@ -276,11 +275,14 @@ def test_a_pulse_that_armed_passes_do_not_show(seed: int) -> None:
 
 @pytest.mark.full
 def test_background_of_which_no_photon_may_be_recorded() -> None:
-    """Armed for 0.8 ns before a pulse: 1.8 background photons are expected, and without any B was 0 ± 0.0006."""
+    """Armed for 0.8 ns before a pulse: 1.8 background photons are expected, and without any B was 0 ± 0.0006.
+
+    Of four intervals (95 %) two or more would leave out the truth with a probability of 1.4 %.
+    """
     truth, _ = random_truth(8600)
-    background = ml.calibrate(stream(truth, 600, 8600), seed=8600).estimates["background"]
-    assert background.low <= truth.background <= background.high
-    assert 0.01 < background.error < 0.2
+    some = [ml.calibrate(stream(truth, 600, n), seed=n).estimates["background"] for n in range(8600, 8604)]
+    assert sum(not each.low <= truth.background <= each.high for each in some) <= 1
+    assert all(0.01 < each.error < 0.2 for each in some)
 
 
 @pytest.mark.parametrize("signal", [1e-9, 1e-3])

@@ -471,7 +471,7 @@ def test_flicker_is_named_and_no_afterpulses(periods: int) -> None:
     assert "flicker of the light, counts relative" in [suspect.name for suspect in result.suspects]
     assert not any(suspect.included for suspect in result.suspects)
     assert not result.fits
-    assert result.estimates["background"].error > 0.03 * 0.15  # twice that of steady light
+    assert "does not fit" in result.estimates["background"].note
 
 
 @pytest.mark.full

@@ -169,8 +169,7 @@ def calibrate_cube(
     off = _errors(trial, some, at, widths_of)
     hold, sigma = (_corrected(*each) for each in zip((hold, sigma), widths_of, off, strict=True))
     estimates = {"dead_time_ns": hold, "pulse_sigma_ns": sigma}
-    final, response_error = trial(hold.value, sigma.value), None
-    light = MaximumLikelihood().estimate(Histograms(some, final, 1))
+    best, final, response_error = trial(*at), trial(hold.value, sigma.value), None
     if pulse == "free":
 
         def with_response(dead: float) -> tuple[System, FloatArray]:
@@ -179,10 +178,12 @@ def calibrate_cube(
         # a dead time just below a period looks like the tail of a pulse, so that each is tried with its own response
         edges = np.unique(np.clip(hold.value + system.period_ns * np.linspace(-1.05, 1.05, 22), 0.0, most))
         deads, share = _law(lambda dead: _log_likelihood(some, with_response(dead)[0]), edges[:-1], edges[1:])
-        estimates = {"dead_time_ns": _corrected(_estimate(deads, share, share >= 0.0)[0], hold_width, off[0])}
-        final, response_error = with_response(estimates["dead_time_ns"].value)
-        light = MaximumLikelihood().estimate(Histograms(some, final, 1))
-    p_values = np.asarray(light.p_value)
+        own = _estimate(deads, share, share >= 0.0)[0]
+        estimates = {"dead_time_ns": _corrected(own, hold_width, off[0])}
+        best, (final, response_error) = with_response(own.value)[0], with_response(estimates["dead_time_ns"].value)
+    light = MaximumLikelihood().estimate(Histograms(some, final, 1))
+    # the test has the bias of the likelihood, so that it is that of its most likely values
+    p_values = np.asarray(MaximumLikelihood().estimate(Histograms(some, best, 1)).p_value)
     known = p_values[np.isfinite(p_values)]
     estimates["background_floor"] = _of_pixel(light, "background", int(np.argmin(light.background)))
     if len(given.counts) == 1:
@@ -224,9 +225,10 @@ def _errors(
 
         def at_width(dead: float, counts: Any = counts) -> tuple[float, float]:
             """Largest logarithm of the likelihood, and where: of a parabola through three widths."""
-            below, middle, above = (_log_likelihood(counts, trial(dead, sigma + x * widths[1])) for x in (-1, 0, 1))
-            slope, bend = 0.5 * (above - below), max(2.0 * middle - below - above, 0.25)  # 1 of a normal law
-            return middle + 0.5 * slope**2 / bend, widths[1] * slope / bend
+            below, middle, above = (_log_likelihood(counts, trial(dead, sigma + x * widths[1])) for x in (-2, 0, 2))
+            slope, bend = 0.25 * (above - below), max(0.25 * (2.0 * middle - below - above), 0.25)  # 1 of a normal law
+            step = float(np.clip(slope / bend, -2.0, 2.0))
+            return middle + step * (slope - 0.5 * bend * step), widths[1] * step
 
         def log(dead: float, of: Callable[[float], tuple[float, float]] = at_width) -> float:
             return of(dead)[0]

@@ -115,7 +115,8 @@ class Limit:
     """An effect that is not in the result: 95 % upper limit in units of `name`, and the estimates of a fit with it.
 
     `ranges`: 95 % intervals of the estimates with the effect, if they extend beyond the intervals without it by more
-    than the stated error. The limit is 1 for a paralyzable detector that fits as well, NaN if the fit did not converge.
+    than the stated error. The limit is 1 for a paralyzable detector that fits as well, NaN if the fit did not
+    converge, or is rejected.
     """
 
     name: str
@@ -126,7 +127,7 @@ class Limit:
     def __str__(self) -> str:
         ranges = ", ".join(f"{name} {low:.5g} to {high:.5g}" for name, (low, high) in self.ranges.items())
         size = f"{self.name} below {self.limit:.3g} (95 %)" if self.limit != 1.0 else "fits as well"
-        size = "no limit, since the fit with it did not converge" if np.isnan(self.limit) else size
+        size = "no limit, since the fit with it did not converge, or is rejected" if np.isnan(self.limit) else size
         return f"{self.words}: {size}" + (f"; then {ranges}" if ranges else "")
 
 

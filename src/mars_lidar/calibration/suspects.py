@@ -131,6 +131,7 @@ class Trial:
 
     def __init__(self, fit: Fit, fitted: Fitted, score: Score) -> None:
         self.fit, self.fitted, self.score, self.effect = fit, fitted, score, score.effect
+        self.direct: Fitted | None = None
         self.model = replace(fitted.model, effects=(*fitted.model.effects, self.effect))
 
     @cached_property
@@ -170,13 +171,14 @@ class Trial:
                 guess = fit.steps(guess, photons, photons / 6.0)[0]
             final = fit.finish(guess)
             if final.converged:
+                self.direct = final if direct and final.p_value > FALSE_ALARM else None
                 return final
         return None
 
     @cached_property
     def final(self) -> Fitted | None:
-        """The fit by short batches."""
-        return self.refit()
+        """The fit by full batches, if it was made and is not rejected, or by short ones."""
+        return self.direct or self.refit()
 
     @property
     def refuted(self) -> bool:

@@ -349,8 +349,8 @@ def _flicker(fit: Fit, fitted: Fitted, counts: float = 8.0, windows: int = 64) -
     if lengths.size == 1:
         return 0.0, -np.inf, 1.0, 1.0
     table = [[x.unevenness(length) for x in (recording, *drawn)] for length in lengths]
-    variance, number, mean = np.array(table).transpose(2, 0, 1)  # (windows, streams) each
-    variance = np.maximum(variance, 1.0 / number)  # of one count more in one window
+    variance, number, mean = np.maximum(np.array(table).transpose(2, 0, 1), 1e-300)  # (windows, streams) each
+    variance = np.maximum(variance, 1.0 / np.maximum(number, 1.0))  # of one count more in one window
     expected = variance[:, 1:].mean(1)
     ratio, even = variance[:, 0] / expected, 3.0 / number[:, 0] + 3.0 / number[:, 1:].sum(1)  # of even counts
     scatter = np.log(variance[1:, 1:] / variance[0, 1:]).var(1, ddof=1) * number[1:, 1:].mean(1) / number[1:, 0]

@@ -468,7 +468,7 @@ class Fit:
                 at = mean.copy()
                 at[model.light + 2] = dead[0]
                 own = Guess(model, at, root_of(cov[np.ix_(~timed, ~timed)]), free[~timed])
-                other = self.finish(self.steps(own, photons, photons / 6.0)[0], known=True)
+                other = self.refit(own, known=True)
                 if other.converged and other.p_value > FALSE_ALARM:
                     return other
             if known or unknown:
@@ -477,6 +477,11 @@ class Fit:
                 p = min(p, early)
         counts, converged = (estimator, jacobian, rest, departure, fresh), bool(size.max() < _NEAR)
         return Fitted(model, free, mean, cov, raw, law, near.offset, *counts, z, p, window_p, converged, interval)
+
+    def refit(self, guess: Guess, known: bool = False) -> Fitted:
+        """Steps by the whole recording from a guess, and the last estimate from there."""
+        photons = float(self.recording.photons)
+        return self.finish(self.steps(guess, photons, photons / 6.0)[0], known)
 
     def _over_delays(
         self, guess: Guess, law: Batch, offset: FloatArray, recorded: FloatArray

@@ -169,6 +169,11 @@ class Model:
         return 1 + 2 * self.returns
 
     @property
+    def amounts(self) -> list[int]:
+        """Indices of the background and of the signals."""
+        return [0, *range(1, self.light, 2)]
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of all parameters."""
         places = [f"_{k + 1}" for k in range(self.returns)] if self.returns > 1 else [""] * self.returns

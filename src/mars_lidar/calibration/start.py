@@ -85,8 +85,7 @@ def saturated(gaps: FloatArray, model: Model, theta: FloatArray, fixed: dict[str
     mean = float(gaps.mean())
     wait = float(np.clip(0.5 * (off**3).mean(), (1e-4 * mean) ** 3, (0.99 * mean) ** 3)) ** (1.0 / 3.0)
     jitter = fixed.get("jitter", (0.5 * max(float(gaps.var()) - wait**2, 0.0)) ** 0.5)
-    amounts = [0, *range(1, k, 2)]
-    theta[amounts] *= model.clock.period_ns / wait / theta[amounts].sum()
+    theta[model.amounts] *= model.clock.period_ns / wait / theta[model.amounts].sum()
     theta[k] = max(float(theta[k]), jitter)
     theta[k + 1] = np.arcsin(jitter / theta[k]) if model.split else jitter
     theta[k + 2] = fixed.get("dead_time_ns", mean - wait)

@@ -157,19 +157,18 @@ class Trial:
 
         `direct`: by full batches, from the size that the score gives; else by steps, and short batches.
         """
-        guess, fitted, photons = self.guess, self.fitted, float(self.fit.recording.photons)
+        guess, fitted = self.guess, self.fitted
         fit = self.fit if direct else self.fit.shorter
         with suppress(ValueError, np.linalg.LinAlgError):
             if direct:
                 near = np.diag(guess.root).copy()
                 near[np.isin(guess.free, fitted.free)] = np.sqrt(np.diag(fitted.covariance))
                 near[guess.free == fitted.model.size] = self.score.error
-                guess = guess._replace(root=np.diag(near))
+                final = fit.finish(guess._replace(root=np.diag(near)))
             else:
                 if fitted.model.light + 2 in guess.free:  # the dead time has absorbed part of the effect
                     guess = guess._replace(theta=with_edge(fit, self.model, guess.theta))
-                guess = fit.steps(guess, photons, photons / 6.0)[0]
-            final = fit.finish(guess)
+                final = fit.refit(guess)
             if final.converged:
                 self.direct = final if direct and final.p_value > FALSE_ALARM else None
                 return final
@@ -218,14 +217,13 @@ def other_light(fit: Fit, fitted: Fitted) -> Fitted | None:
     """
     from scipy.special import lambertw
 
-    model, theta, photons = fitted.model, fitted.model.bounded(fitted.theta), float(fit.recording.photons)
-    amounts = [0, *range(1, model.light, 2)]
-    x = float(theta[amounts].sum() * theta[model.light + 2] / model.clock.period_ns)
-    theta[amounts] *= -lambertw(-x * np.exp(-x), -1 if x < 1.0 else 0).real / x
+    model, theta = fitted.model, fitted.model.bounded(fitted.theta)
+    x = float(theta[model.amounts].sum() * theta[model.light + 2] / model.clock.period_ns)
+    theta[model.amounts] *= -lambertw(-x * np.exp(-x), -1 if x < 1.0 else 0).real / x
     with suppress(ValueError, np.linalg.LinAlgError):
         if fit.distance(model, theta) < _FAR**2:
             guess = Guess(model, theta, np.diag(0.5 * model.scale(theta)[fitted.free]), fitted.free)
-            final = fit.finish(fit.steps(guess, photons, photons / 6.0)[0])
+            final = fit.refit(guess)
             if final.converged and final.p_value > FALSE_ALARM:
                 return final
     return None
@@ -246,7 +244,6 @@ def refitted(scores: Scores, trials: list[Trial]) -> tuple[Fitted, list[tuple[Sc
     """
     fit, fitted = scores.fit, scores.fitted
     size = fitted.model.size
-
     p_value = fitted.p_value if fitted.converged else 0.0
 
     def better(final: Fitted) -> bool:
@@ -282,9 +279,10 @@ def refitted(scores: Scores, trials: list[Trial]) -> tuple[Fitted, list[tuple[Sc
             again = Scores(fit, other).of(trial.effect, small if score is trial.score else final.theta)
             if not significant(final, 0.5 * (score.z + again.z), max(p_value, other.p_value)):
                 return (other, []) if p_value < FALSE_ALARM else None
-    last = final if direct else fit.finish(final.guess, finished=True)
-    if last is not final and last.converged:
-        final, score = last, score_of(trial, last)
+    if not direct:
+        last = fit.finish(final.guess, finished=True)
+        if last.converged:
+            final, score = last, score_of(trial, last)
     if not (better(final) and significant(final, score.z)):
         return None
     return final, [(score, fitted.misfit_z - final.misfit_z)]
